@@ -68,8 +68,8 @@ def _list(_: argparse.Namespace) -> int:
             broken += 1
             print(f"{name}  cannot be loaded: {error}", file=sys.stderr)
         else:
-            ours = robot.folder.parent == Path(__file__).resolve().parent
-            print(f"{name}  {robot.title}" + ("" if ours else f"  ({robot.folder})"))
+            is_own = robot.folder.parent == Path(__file__).resolve().parent
+            print(f"{name}  {robot.title}" + ("" if is_own else f"  ({robot.folder})"))
     return 1 if broken else 0
 
 
@@ -77,12 +77,12 @@ def _check(options: argparse.Namespace) -> int:
     return _print_findings(inspect_robot(options.name))
 
 
-def _print_findings(found: Inspection) -> int:
-    print("\n".join(found.lines))
-    print("\n".join(f"warning: {sentence}" for sentence in found.warnings) or "no warnings")
-    for sentence in found.errors:
+def _print_findings(inspection: Inspection) -> int:
+    print("\n".join(inspection.lines))
+    print("\n".join(f"warning: {sentence}" for sentence in inspection.warnings) or "no warnings")
+    for sentence in inspection.errors:
         print(f"error: {sentence}", file=sys.stderr)
-    return 1 if found.errors else 0
+    return 1 if inspection.errors else 0
 
 
 def _with_group(name: str, group: str) -> Robot:
@@ -124,24 +124,25 @@ def _fk(options: argparse.Namespace) -> int:
 def _new(options: argparse.Namespace) -> int:
     """Draft a robot, then print the findings of `check` on the draft, and the next steps."""
     into = options.into or next(iter(robot_folders()), Path())
-    made = draft_robot(options.name, options.urdf, into, options.copies)
-    said = _print_findings(made.inspection)
-    if missing := made.pictures.missing:
+    drafted = draft_robot(options.name, options.urdf, into, options.copies)
+    exit_code = _print_findings(drafted.inspection)
+    if missing := drafted.pictures.missing:
         print(
             f"shapes: {len(missing)} meshes were not found or cannot be read, {missing[0]} the first; put them where"
         )
         print(
             "  the URDF says they are and draft again, or as LINK.stl into the robot's folder of $EVA_ROBOT_MESHES"
         )
-    if drawn := made.pictures.drawn:
+    if drawn := drafted.pictures.drawn:
         print(f"shapes: cylinders from joint to joint stand in for {', '.join(drawn)}")
-    print(f"drafted: {made.folder}")
+    print(f"drafted: {drafted.folder}")
     if options.name not in robot_names():
         print(f"found by name once EVA_ROBOTS={into.resolve()} is set; until then by its folder")
     print(
-        f"next: verify what {made.folder / 'README.md'} lists, edit robot.toml, python -m robots check {options.name}"
+        f"next: verify what {drafted.folder / 'README.md'} lists, edit robot.toml, "
+        f"python -m robots check {options.name}"
     )
-    return said
+    return exit_code
 
 
 if __name__ == "__main__":

@@ -43,19 +43,19 @@ def build_arm_chain(
     key = f"{file}: groups.{table.name}"
     _check_pinned(f"{key}.pinned", tree, table)
     with error_context(f"{key}: from frame to eef_link"):
-        way = tree.between(table.frame, table.eef_link)
+        path = tree.between(table.frame, table.eef_link)
     movers = {
         name: int(dim)
-        for other in copy_of(group, groups)
-        if other is not group
-        for name, dim in zip(other.urdf_joints, other.joint_dims, strict=True)
+        for sibling in copy_of(group, groups)
+        if sibling is not group
+        for name, dim in zip(sibling.urdf_joints, sibling.joint_dims, strict=True)
     }
-    carried = [joint.name for joint in way if joint.name in movers]
+    carried = [joint.name for joint in path if joint.name in movers]
     if not carried:
         with error_context(key):
             chain = Chain(tree, table.frame, table.eef_link, table.urdf_joints, table.pinned)
         return replace(group, chain=chain)
-    root = next((joint.parent for joint in way if joint.name in table.urdf_joints), None)
+    root = next((joint.parent for joint in path if joint.name in table.urdf_joints), None)
     if root is None:
         raise RobotError(f"{key}.urdf_joints: none lies between {table.frame} and {table.eef_link}")
     pinned = {name: value for name, value in table.pinned.items() if name not in carried}

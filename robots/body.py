@@ -41,11 +41,11 @@ class Body:
 
     def __init__(self, robot: Robot) -> None:
         tree = urdf.read(robot.urdf)
-        made = [_Copy(robot, tree, groups) for groups in urdf_copies(robot.groups)]
-        names = [[copy.part(link) for link in copy.links] for copy in made]
+        copies = [_Copy(robot, tree, groups) for groups in urdf_copies(robot.groups)]
+        names = [[copy.part(link) for link in copy.links] for copy in copies]
         self.parts = tuple(name for part in names for name in part)
         starts = np.cumsum([0, *(len(part) for part in names[:-1])]).tolist()
-        placed = list(zip(starts, made, strict=True))
+        placed = list(zip(starts, copies, strict=True))
         self._links = [
             {link: start + index for index, link in enumerate(copy.links)} for start, copy in placed
         ]
@@ -59,10 +59,10 @@ class Body:
         }
         self._dim = robot.dim
         self._name = robot.name
-        self._coupling = np.concatenate([copy.coupling for copy in made])  # [P, D]
-        self._offsets = np.concatenate([copy.offsets for copy in made])  # [P]
-        self._low, self._high = np.concatenate([copy.bounds for copy in made], axis=1)
-        self._tables = np.concatenate([copy.tables for copy in made])  # [P, 4, 16]
+        self._coupling = np.concatenate([copy.coupling for copy in copies])  # [P, D]
+        self._offsets = np.concatenate([copy.offsets for copy in copies])  # [P]
+        self._low, self._high = np.concatenate([copy.bounds for copy in copies], axis=1)
+        self._tables = np.concatenate([copy.tables for copy in copies])  # [P, 4, 16]
         self.above = np.concatenate([copy.above_from(start) for start, copy in placed])
         self._layers = _layers(self.above)
 

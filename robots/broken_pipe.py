@@ -109,4 +109,4 @@ def _descriptor(stream: TextIO) -> int:
 def _unread(number: int) -> bool:
     poll = select.poll()
     poll.register(number, 0)
-    return any(told & select.POLLERR for _, told in poll.poll(0))
+    return any(events & select.POLLERR for _, events in poll.poll(0))

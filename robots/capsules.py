@@ -37,19 +37,19 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
     by_link: dict[str, list[Shape]] = {}
     for shape in shapes.read_shapes(robot.urdf):
         by_link.setdefault(shape.link, []).append(shape)
-    found = {link: _remembered(shown) for link, shown in by_link.items()}
-    found |= {link: tuple(map(_declared, tables)) for link, tables in robot.collision.capsules.items()}
-    return {link: made for link, made in found.items() if link not in robot.collision.without}
+    by_name = {link: _remembered(link_shapes) for link, link_shapes in by_link.items()}
+    by_name |= {link: tuple(map(_declared, tables)) for link, tables in robot.collision.capsules.items()}
+    return {link: parts for link, parts in by_name.items() if link not in robot.collision.without}
 
 
-def _remembered(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
+def _remembered(link_shapes: Sequence[Shape]) -> tuple[Capsule, ...]:
     """Return the result of `covering_capsules` from a cache, because a station loads the same robot several times."""
-    key = b"".join(_content(shape) for shape in shown)
+    key = b"".join(_content(shape) for shape in link_shapes)
     if key not in _about:
-        made = covering_capsules(shown)
-        for capsule in made:
+        covering = covering_capsules(link_shapes)
+        for capsule in covering:
             capsule.start.flags.writeable = capsule.end.flags.writeable = False
-        _about[key] = made
+        _about[key] = covering
     return _about[key]
 
 
@@ -74,23 +74,23 @@ def covering_capsules(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
     }
     left = set(range(len(pieces)))
     while len(left) > 1:
-        one, other = min(
+        i, j = min(
             combinations(sorted(left), 2), key=lambda pair: grown[pair] - rooms[pair[0]] - rooms[pair[1]]
         )
-        if len(left) <= PIECES and grown[one, other] > rooms[one] + rooms[other]:
+        if len(left) <= PIECES and grown[i, j] > rooms[i] + rooms[j]:
             break
-        left -= {one, other}
+        left -= {i, j}
         joined = len(pieces)
-        pieces.append(pieces[one] + pieces[other])
-        rooms.append(grown[one, other])
+        pieces.append(pieces[i] + pieces[j])
+        rooms.append(grown[i, j])
         grown |= {(piece, joined): _capsule_volume(pieces[piece] + pieces[joined]) for piece in left}
         left.add(joined)
     return tuple(smallest_capsule(pieces[piece]) for piece in sorted(left))
 
 
-def _capsule_volume(shown: Sequence[Shape]) -> float:
+def _capsule_volume(link_shapes: Sequence[Shape]) -> float:
     """Return the volume of a capsule around the shapes [m3]."""
-    capsule = smallest_capsule(shown, steps=1)
+    capsule = smallest_capsule(link_shapes, steps=1)
     length = float(np.linalg.norm(capsule.end - capsule.start))
     return float(np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius))
 
@@ -123,13 +123,13 @@ def _declared(table: CapsuleTable) -> Capsule:
     return Capsule(np.array(table.start), np.array(table.end), table.radius)
 
 
-def _balls(shown: Sequence[Shape]) -> tuple[Float64, Float64]:
+def _balls(link_shapes: Sequence[Shape]) -> tuple[Float64, Float64]:
     """Return balls whose convex hull covers the shapes: centres [n, 3] in the link's frame, and radii [n].
 
     The corners of shapes have radius 0.
     """
     centres, sizes = [], []
-    for shape in shown:
+    for shape in link_shapes:
         corners, size = _corners(shape)
         centres.append(corners @ shape.origin[:3, :3].T + shape.origin[:3, 3])
         sizes.append(np.full(len(corners), size))

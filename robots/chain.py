@@ -172,14 +172,14 @@ class Chain:
         """Return row [n] and offset of a joint, whose value is row . q + offset."""
         row = np.zeros(self.size)
         factor, offset = 1.0, 0.0
-        seen = [joint.name]
+        names = [joint.name]
         while joint.mimic and joint.name not in self.joints and joint.name not in pinned:
             offset += factor * joint.mimic.offset
             factor *= joint.mimic.multiplier
             joint = urdf.joint(joint.mimic.joint)
-            if joint.name in seen:
-                raise RobotError(f"{urdf.path}: joints {', '.join(seen)} mimic each other in a circle")
-            seen.append(joint.name)
+            if joint.name in names:
+                raise RobotError(f"{urdf.path}: joints {', '.join(names)} mimic each other in a circle")
+            names.append(joint.name)
         if joint.name in self.joints:
             row[self.joints.index(joint.name)] = factor
             return row, offset

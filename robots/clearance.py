@@ -38,8 +38,8 @@ def segment_distances(start: Float64, way: Float64, other: Float64, other_way: F
     return np.asarray(np.sqrt(_dot(apart, apart)))
 
 
-def _dot(one: Float64, other: Float64) -> Float64:
-    return np.asarray(np.einsum("...i,...i->...", one, other))
+def _dot(first: Float64, second: Float64) -> Float64:
+    return np.asarray(np.einsum("...i,...i->...", first, second))
 
 
 MARGIN = 0.005  # [m] default distance below which links count as touching
@@ -71,19 +71,19 @@ class Clearance:
 
     def __init__(self, robot: Robot) -> None:
         body = Body(robot)
-        found = [
+        parts = [
             (part, capsule)
-            for link, made in capsules(robot).items()
+            for link, link_capsules in capsules(robot).items()
             for part in body.parts_showing(link)
-            for capsule in made
+            for capsule in link_capsules
         ]
-        found.sort(key=lambda one: one[0])
+        parts.sort(key=lambda one: one[0])
         self._body = body
-        self._parts = np.array([part for part, _ in found], dtype=np.intp)
+        self._parts = np.array([part for part, _ in parts], dtype=np.intp)
         self._names = [body.parts[part] for part in self._parts]
-        self._radii = np.array([capsule.radius for _, capsule in found])
-        self._ends = np.ones((len(found), 4, 2))  # in the link, homogeneous
-        for ends, (_, capsule) in zip(self._ends, found, strict=True):
+        self._radii = np.array([capsule.radius for _, capsule in parts])
+        self._ends = np.ones((len(parts), 4, 2))  # in the link, homogeneous
+        for ends, (_, capsule) in zip(self._ends, parts, strict=True):
             ends[:3, 0], ends[:3, 1] = capsule.start, capsule.end
         self._fingers = np.asarray(body.moving_mask()[self._parts][:, list(robot.gripper_dims)].any(axis=1))
         self._select_pairs(*_candidates(robot, body, self._parts))
@@ -103,10 +103,13 @@ class Clearance:
         poses = self._body.poses(q)
         ends = poses[..., self._parts, :3, :] @ self._ends  # [..., N, 3, 2]
         starts = ends[..., 0]
-        ways = ends[..., 1] - starts
-        one, other = self._first, self._second
+        directions = ends[..., 1] - starts
+        first, second = self._first, self._second
         apart = segment_distances(
-            starts[..., one, :], ways[..., one, :], starts[..., other, :], ways[..., other, :]
+            starts[..., first, :],
+            directions[..., first, :],
+            starts[..., second, :],
+            directions[..., second, :],
         )
         lowest = ends[..., self._over, 2, :].min(axis=-1)
         return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
@@ -126,8 +129,8 @@ class Clearance:
         self._thick = np.concatenate([self._radii[first] + self._radii[second], standing])
         names = self._names
         self.pairs = (
-            *((names[one], names[other]) for one, other in zip(first, second, strict=True)),
-            *((names[one], TABLE) for one in over),
+            *((names[i], names[j]) for i, j in zip(first, second, strict=True)),
+            *((names[i], TABLE) for i in over),
         )
 
     def _telling(self, robot: Robot) -> tuple[_Indices, _Indices, _Indices]:
@@ -161,8 +164,8 @@ def get_clearance(robot: Robot) -> Clearance:
 
 def _mirror_key(pair: tuple[str, str]) -> tuple[str, ...]:
     """Return a key that the corresponding pairs of equal arms share; for a pair of two arms, the pair itself."""
-    (group, _, link), (other_group, _, other) = (name.partition("/") for name in pair)
-    return (link, other or other_group) if group == other_group or not other else pair
+    (group, _, link), (other_group, _, other_link) = (name.partition("/") for name in pair)
+    return (link, other_link or other_group) if group == other_group or not other_link else pair
 
 
 def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _Indices, _Indices]:
@@ -177,8 +180,8 @@ def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _I
     roots = np.array([_root(body, part) for part in parts])
     between = (moved[:, None] ^ moved[None]).sum(axis=-1)
     together = roots[:, None] == roots[None]
-    wanted = between >= np.where(together, 2, 1)
-    first, second = (side.astype(np.intp) for side in np.nonzero(np.triu(wanted, 1)))
+    checked = between >= np.where(together, 2, 1)
+    first, second = (side.astype(np.intp) for side in np.nonzero(np.triu(checked, 1)))
     ignored = {frozenset(pair) for pair in robot.collision.ignore}
     names = [body.parts[part] for part in parts]
     links = [name.partition("/")[2] for name in names]
@@ -215,13 +218,13 @@ def collision_problems(robot: Robot, margin: float = MARGIN) -> list[str]:
     least = dict(zip(clearance.pairs, clearance.touch_thresholds(margin).tolist(), strict=True))
     if not clearance.pairs:
         return ["collision: no two links are looked at; links need shapes, or capsules in robot.toml"]
-    found: dict[tuple[str, str, str], float] = {}
+    distances: dict[tuple[str, str, str], float] = {}
     for name, pose in robot.poses.items():
-        for (one, other), apart in zip(clearance.pairs, clearance.distances(pose).tolist(), strict=True):
-            found[name, one, other] = min(apart, found.get((name, one, other), apart))
+        for (first, second), apart in zip(clearance.pairs, clearance.distances(pose).tolist(), strict=True):
+            distances[name, first, second] = min(apart, distances.get((name, first, second), apart))
     return [
-        f"poses.{name}: {one} and {other} are {1000 * apart:.0f} mm apart, needed: {1000 * least[one, other]:g}; "
+        f"poses.{name}: {first} and {second} are {1000 * apart:.0f} mm apart, needed: {1000 * least[first, second]:g}; "
         "correct the pose or the capsules, or name the pair in collision.ignore"
-        for (name, one, other), apart in found.items()
-        if apart < least[one, other]
+        for (name, first, second), apart in distances.items()
+        if apart < least[first, second]
     ]

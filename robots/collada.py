@@ -29,24 +29,26 @@ def read_points(path: Path) -> Float64:
         root = parsed(path)
     except RobotError as error:
         raise ValueError(str(error.__cause__ or error)) from error
-    geometries = {f"#{one.get('id')}": _positions(one) for one in root.iterfind(f".//{_NAMESPACE}geometry")}
-    library = {f"#{one.get('id')}": one for one in root.iterfind(f".//{_NAMESPACE}node")}
+    geometries = {
+        f"#{element.get('id')}": _positions(element) for element in root.iterfind(f".//{_NAMESPACE}geometry")
+    }
+    library = {f"#{element.get('id')}": element for element in root.iterfind(f".//{_NAMESPACE}node")}
     unit = root.find(f"{_NAMESPACE}asset/{_NAMESPACE}unit")
     metres = 1.0 if unit is None else float(unit.get("meter", "1"))
     visits = iter(range(_MOST_NODES))
-    found = [
+    parts = [
         geometries[url] @ place[:3, :3].T + place[:3, 3]
         for scene in root.iterfind(f".//{_NAMESPACE}visual_scene")
         for node in scene.iterfind(f"{_NAMESPACE}node")
         for url, place in _instances(node, np.eye(4), library, 0, visits)
         if url in geometries
     ]
-    return np.concatenate(found) * metres if found else np.empty((0, 3))
+    return np.concatenate(parts) * metres if parts else np.empty((0, 3))
 
 
 def _positions(geometry: ET.Element) -> Float64:
     """Return the points [n, 3] of a geometry's meshes."""
-    sources = {f"#{one.get('id')}": one for one in geometry.iterfind(f".//{_NAMESPACE}source")}
+    sources = {f"#{child.get('id')}": child for child in geometry.iterfind(f".//{_NAMESPACE}source")}
     parts = []
     for element in geometry.iterfind(f".//{_NAMESPACE}vertices/{_NAMESPACE}input"):
         source = sources.get(element.get("source", ""))
@@ -75,8 +77,8 @@ def _instances(
             yield element.get("url", ""), place
         elif kind == "node":
             yield from _instances(element, place, library, depth + 1, visits)
-        elif kind == "instance_node" and (shown := library.get(element.get("url", ""))) is not None:
-            yield from _instances(shown, place, library, depth + 1, visits)
+        elif kind == "instance_node" and (target := library.get(element.get("url", ""))) is not None:
+            yield from _instances(target, place, library, depth + 1, visits)
 
 
 def _motion(kind: str, numbers: Float64) -> Float64:

@@ -94,8 +94,8 @@ class CapsuleTable(Table):
     radius: Positive
 
 
-def _several(given: Any) -> Any:
-    return [given] if isinstance(given, dict) else given
+def _several(value: Any) -> Any:
+    return [value] if isinstance(value, dict) else value
 
 
 Capsules = Annotated[list[CapsuleTable], BeforeValidator(_several), Field(min_length=1)]
@@ -203,11 +203,11 @@ def read(path: Path) -> RobotTable:
     """
     try:
         with path.open("rb") as file:
-            given = tomllib.load(file)
+            document = tomllib.load(file)
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise RobotError(f"{path}: cannot be read as TOML: {error}") from error
     try:
-        return RobotTable.model_validate(given)
+        return RobotTable.model_validate(document)
     except ValidationError as error:
         sentences = "\n".join(f"{path}: {_sentence(detail)}" for detail in error.errors())
         raise RobotError(sentences) from error

@@ -25,9 +25,9 @@ def error_context(key: str) -> Iterator[None]:
 
 
 def reject_duplicates(file: Path, key: str, given: list[str]) -> None:
-    twice = sorted({name for name in given if given.count(name) > 1})
-    if twice:
-        raise RobotError(f"{file}: {key}: {', '.join(twice)} more than once; each is allowed once")
+    repeated = sorted({name for name in given if given.count(name) > 1})
+    if repeated:
+        raise RobotError(f"{file}: {key}: {', '.join(repeated)} more than once; each is allowed once")
 
 
 def check_movers(key: str, tree: Urdf, names: Iterable[str]) -> None:

@@ -43,10 +43,10 @@ def apply_gripper_choices(
 
 def _with_gripper(group: GroupTable, choice: GripperChoice) -> GroupTable:
     assert group.gripper is not None
-    given = {key: value for key in GripperChoice.__slots__ if (value := getattr(choice, key)) is not None}
+    fields = {key: value for key in GripperChoice.__slots__ if (value := getattr(choice, key)) is not None}
     if choice.binary is False:
-        given = {"threshold": None, "hysteresis": None} | given
-    return group.model_copy(update={"gripper": group.gripper.model_copy(update=given)})
+        fields = {"threshold": None, "hysteresis": None} | fields
+    return group.model_copy(update={"gripper": group.gripper.model_copy(update=fields)})
 
 
 def gripper_of(key: str, tree: Urdf, table: GripperTable, dof: int) -> Gripper:

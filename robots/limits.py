@@ -42,8 +42,8 @@ def group_limits(file: Path, tree: Urdf, table: GroupTable) -> Limits:
     limits = Limits([], [], [], [])
     for name, urdf_name in zip(wire, table.urdf_joints, strict=True):
         for side, values in (("lower", limits.lower), ("upper", limits.upper), ("velocity", limits.velocity)):
-            given: float | None = getattr(tree.joint(urdf_name), side) if urdf_name else None
-            value = _overridden(f"{table.name}.{name}", side, given, overrides.get(name), limits.overrides)
+            declared: float | None = getattr(tree.joint(urdf_name), side) if urdf_name else None
+            value = _overridden(f"{table.name}.{name}", side, declared, overrides.get(name), limits.overrides)
             if value is None:
                 raise RobotError(
                     f"{key}: joint {name!r}: the URDF gives no {side} for {urdf_name or 'it'}; needed: an override"
@@ -62,10 +62,10 @@ def group_limits(file: Path, tree: Urdf, table: GroupTable) -> Limits:
 
 
 def _overridden(
-    joint: str, side: str, given: float | None, override: OverrideTable | None, sentences: list[str]
+    joint: str, side: str, declared: float | None, override: OverrideTable | None, sentences: list[str]
 ) -> float | None:
     replacement: float | None = None if override is None else getattr(override, side)
     if override is None or replacement is None:
-        return given
-    sentences.append(f"{joint} {side} {given} -> {replacement}: {override.reason}")
+        return declared
+    sentences.append(f"{joint} {side} {declared} -> {replacement}: {override.reason}")
     return replacement

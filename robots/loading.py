@@ -41,11 +41,11 @@ def robot_folders() -> tuple[Path, ...]:
 
 def _find_folders() -> dict[str, Path]:
     """Return the folders of all robots by name; an included robot cannot be replaced by another of the same name."""
-    found: dict[str, Path] = {}
+    folders: dict[str, Path] = {}
     for root in (_HERE, *robot_folders()):
         for file in sorted(root.glob(f"*/{_FILE}")):
-            found.setdefault(file.parent.name, file.parent.resolve())
-    return found
+            folders.setdefault(file.parent.name, file.parent.resolve())
+    return folders
 
 
 def load_robot(
@@ -73,11 +73,11 @@ def load_robot(
     _check_collision(file, table, tree)
     chosen = apply_gripper_choices(file, _chosen(file, table, groups), grippers or {})
     starts = np.cumsum([0, *(len(entry.joints) for entry in chosen)]).tolist()
-    made = tuple(_group(file, tree, entry, start) for entry, start in zip(chosen, starts, strict=False))
-    made = tuple(
-        build_arm_chain(file, tree, entry, group, made) for entry, group in zip(chosen, made, strict=True)
+    built = tuple(_group(file, tree, entry, start) for entry, start in zip(chosen, starts, strict=False))
+    built = tuple(
+        build_arm_chain(file, tree, entry, group, built) for entry, group in zip(chosen, built, strict=True)
     )
-    check_mounts(file, chosen, made)
+    check_mounts(file, chosen, built)
     limits = [group_limits(file, tree, entry) for entry in chosen]
     lower, upper, velocity = (
         read_only([number for part in limits for number in getattr(part, side)])
@@ -88,9 +88,9 @@ def load_robot(
         title=table.title,
         folder=folder,
         urdf=tree.path,
-        groups=made,
+        groups=built,
         cameras=tuple(Camera(name, key) for name, key in table.cameras.items()),
-        poses=_poses(file, table, made, lower, upper),
+        poses=_poses(file, table, built, lower, upper),
         lower=lower,
         upper=upper,
         velocity=velocity,
@@ -114,10 +114,10 @@ def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list
 
     Raises: RobotError for unknown groups, or if there would be none.
     """
-    known = [group.name for group in table.groups]
-    unknown = [name for name in groups or () if name not in known]
+    names = [group.name for group in table.groups]
+    unknown = [name for name in groups or () if name not in names]
     if unknown or (groups is not None and not groups):
-        raise RobotError(f"{file}: groups {unknown or groups} were chosen; allowed: {', '.join(known)}")
+        raise RobotError(f"{file}: groups {unknown or groups} were chosen; allowed: {', '.join(names)}")
     if groups is None:
         always = [group for group in table.groups if not group.optional]
         if not always:
@@ -130,8 +130,8 @@ def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list
 
 def _tree(file: Path, path: Path) -> Urdf:
     if not path.is_file():
-        there = ", ".join(sorted(other.name for other in path.parent.glob("*.urdf"))) or "none"
-        raise RobotError(f"{file}: urdf = {path.name!r} is no file; URDFs in the folder: {there}")
+        urdfs = ", ".join(sorted(urdf_path.name for urdf_path in path.parent.glob("*.urdf"))) or "none"
+        raise RobotError(f"{file}: urdf = {path.name!r} is no file; URDFs in the folder: {urdfs}")
     return urdf.read(path)
 
 
@@ -139,13 +139,13 @@ def _check_ros(file: Path, table: RobotTable) -> None:
     """Raise RobotError if topics name unknown cameras or groups."""
     if table.ros is None:
         return
-    for key, given, known in (
+    for key, names, allowed in (
         ("cameras", table.ros.cameras, list(table.cameras)),
         ("groups", table.ros.groups, [group.name for group in table.groups]),
     ):
-        unknown = [name for name in given if name not in known]
+        unknown = [name for name in names if name not in allowed]
         if unknown:
-            raise RobotError(f"{file}: ros.{key} names {', '.join(unknown)}; allowed: {', '.join(known)}")
+            raise RobotError(f"{file}: ros.{key} names {', '.join(unknown)}; allowed: {', '.join(allowed)}")
 
 
 def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
@@ -159,9 +159,9 @@ def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
         if unknown := [link for link in named if link not in tree.links]:
             allowed = ", ".join(sorted(tree.links))
             raise RobotError(f"{file}: collision.{key} names {', '.join(unknown)}; allowed: {allowed}")
-    known = {*tree.links, TABLE, *(f"{group}/{link}" for group in groups for link in tree.links)}
+    names = {*tree.links, TABLE, *(f"{group}/{link}" for group in groups for link in tree.links)}
     for pair in collision.ignore:
-        if unknown := [link for link in pair if link not in known]:
+        if unknown := [link for link in pair if link not in names]:
             raise RobotError(
                 f"{file}: collision.ignore names {', '.join(unknown)}; allowed: {TABLE}, a link, or GROUP/LINK, of "
                 f"{', '.join(sorted(tree.links))}"
@@ -169,12 +169,12 @@ def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
 
 
 def _folder(robot: str | Path) -> Path:
-    known = _find_folders()
-    if isinstance(robot, str) and robot in known:
-        return known[robot]
+    folders = _find_folders()
+    if isinstance(robot, str) and robot in folders:
+        return folders[robot]
     folder = Path(robot)
     if not (folder / _FILE).is_file():
-        raise RobotError(f"no robot {str(robot)!r}; known: {', '.join(known)}, or a folder with {_FILE}")
+        raise RobotError(f"no robot {str(robot)!r}; known: {', '.join(folders)}, or a folder with {_FILE}")
     return folder.resolve()
 
 
@@ -216,10 +216,10 @@ def _poses(
 ) -> dict[str, Float64]:
     if "home" not in table.poses:
         raise RobotError(f"{file}: poses: {', '.join(table.poses) or 'none'} given; needed: home")
-    known = [group.name for group in table.groups]
+    names = [group.name for group in table.groups]
     for name, parts in table.poses.items():
-        if list(parts) != known:
-            raise RobotError(f"{file}: poses.{name} gives {', '.join(parts)}; needed: {', '.join(known)}")
+        if list(parts) != names:
+            raise RobotError(f"{file}: poses.{name} gives {', '.join(parts)}; needed: {', '.join(names)}")
     return {
         name: _pose(f"{file}: poses.{name}", parts, groups, lower, upper)
         for name, parts in table.poses.items()

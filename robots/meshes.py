@@ -26,12 +26,12 @@ def mesh_roots(folder: Path) -> tuple[Path, ...]:
     """Return the folders that may contain meshes of the robot in `folder`: its own, and
     $EVA_ROBOT_MESHES/<its name>.
     """
-    given = os.environ.get(ENVIRONMENT, "")
-    if not given:
+    text = os.environ.get(ENVIRONMENT, "")
+    if not text:
         return (folder.resolve(),)
-    meshes = Path(given).expanduser()
+    meshes = Path(text).expanduser()
     if not meshes.is_dir():
-        raise RobotError(f"{ENVIRONMENT} = {given!r} is no folder; needed: one with a folder per robot")
+        raise RobotError(f"{ENVIRONMENT} = {text!r} is no folder; needed: one with a folder per robot")
     return folder.resolve(), (meshes / folder.name).resolve()
 
 
@@ -48,7 +48,7 @@ def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
     allowed = mesh_roots(folder)
     try:
         places = [place for root in allowed for place in _places(root, owner, filename)]
-        there = [place for place in places if place.is_file()]
+        existing = [place for place in places if place.is_file()]
     except (OSError, ValueError) as error:  # name too long for the file system, or with a NUL character
         raise RobotError(f"{owner}: mesh {filename!r:.120} is no name of a file: {error!s:.80}") from error
     for place in places:
@@ -56,7 +56,7 @@ def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
             raise RobotError(
                 f"{owner}: mesh {filename!r} is {place}; allowed: files in {' or '.join(map(str, allowed))}"
             )
-    for place in there:
+    for place in existing:
         return place
     raise RobotError(
         f"{owner}: mesh {filename!r} is missing; looked for {', '.join(map(str, dict.fromkeys(places)))}"
@@ -93,14 +93,14 @@ def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
     """Yield the paths in `root` at which the file may be; a package is the folder with its name there, or `root`
     itself.
     """
-    scheme, separator, rest = filename.partition("://")
+    scheme, separator, path = filename.partition("://")
     if not separator:
         yield (root / filename).resolve()
     elif scheme == "file":
-        yield Path(unquote(rest)).resolve()
+        yield Path(unquote(path)).resolve()
     elif scheme == "package":
-        _, _, inside = rest.partition("/")
-        yield (root / rest).resolve()
+        _, _, inside = path.partition("/")
+        yield (root / path).resolve()
         yield (root / inside).resolve()
     else:
         raise RobotError(f"{owner}: mesh {filename!r}; allowed: a path, package://... or file://...")
@@ -129,11 +129,11 @@ def _stl(content: bytes) -> Float64:
         return np.frombuffer(content, triangle, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     if not content.lstrip().startswith(b"solid"):
         raise ValueError("neither a binary STL of the length that it says nor a text one")
-    found = re.findall(rf"^{_SPACE}*vertex{_CORNER}", content.decode(errors="replace"), re.MULTILINE)
-    return np.array(found, dtype=np.float64).reshape(-1, 3)
+    vertices = re.findall(rf"^{_SPACE}*vertex{_CORNER}", content.decode(errors="replace"), re.MULTILINE)
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3)
 
 
 def _obj(text: str) -> Float64:
     """Return the vertices [n, 3] of an OBJ file."""
-    found = re.findall(rf"^{_SPACE}*v{_CORNER}", text, re.MULTILINE)
-    return np.array(found, dtype=np.float64).reshape(-1, 3)
+    vertices = re.findall(rf"^{_SPACE}*v{_CORNER}", text, re.MULTILINE)
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3)

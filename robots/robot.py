@@ -245,17 +245,17 @@ def urdf_copies(groups: Sequence[Group]) -> list[list[Group]]:
     """Return the groups for each copy of the URDF; copies are made so that each joint is moved at most once per
     copy.
     """
-    found: list[tuple[set[str], list[Group]]] = []
+    copies: list[tuple[set[str], list[Group]]] = []
     for group in groups:
         joints = {*filter(None, group.urdf_joints), *(group.gripper.fingers if group.gripper else ())}
-        for taken, members in found:
-            if not taken & joints:
-                taken |= joints
+        for used, members in copies:
+            if not used & joints:
+                used |= joints
                 members.append(group)
                 break
         else:
-            found.append((joints, [group]))
-    return [members for _, members in found]
+            copies.append((joints, [group]))
+    return [members for _, members in copies]
 
 
 def copy_of(group: Group, groups: Sequence[Group]) -> list[Group]:

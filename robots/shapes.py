@@ -113,11 +113,11 @@ def _shapes(
 def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Colour]) -> Shape:
     owner = f"link {link!r}"
     geometry = visual.find("geometry")
-    given = [] if geometry is None else list(geometry)
-    if len(given) != 1 or given[0].tag not in KINDS:
-        tags = ", ".join(f"<{element.tag}>" for element in given) or "nothing"
+    elements = [] if geometry is None else list(geometry)
+    if len(elements) != 1 or elements[0].tag not in KINDS:
+        tags = ", ".join(f"<{element.tag}>" for element in elements) or "nothing"
         raise RobotError(f"{path}: {owner}: a visual shows {tags}; allowed: one of {', '.join(KINDS)}")
-    element = given[0]
+    element = elements[0]
     size = size_of(path, owner, element)
     file = None
     if element.tag == "mesh":

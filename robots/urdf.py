@@ -124,14 +124,14 @@ class Urdf:
 
         The value of `joint` is factor * (value of the returned joint) + offset.
         """
-        factor, offset, seen = 1.0, 0.0, [joint.name]
+        factor, offset, names = 1.0, 0.0, [joint.name]
         while joint.mimic is not None:
             offset += factor * joint.mimic.offset
             factor *= joint.mimic.multiplier
             joint = self.joint(joint.mimic.joint)
-            if joint.name in seen:
-                raise RobotError(f"{self.path}: joints {', '.join(seen)} mimic each other in a circle")
-            seen.append(joint.name)
+            if joint.name in names:
+                raise RobotError(f"{self.path}: joints {', '.join(names)} mimic each other in a circle")
+            names.append(joint.name)
         return joint, factor, offset
 
     def masters(self) -> set[str]:
@@ -151,12 +151,12 @@ def read(path: Path) -> Urdf:
     _refuse_twice(path, "link", links)
     _refuse_twice(path, "joint", [joint.name for joint in joints])
     root = _root(path, links, joints)
-    held = tuple(
+    pinned = tuple(
         joint.name
         for joint, element in zip(joints, robot.findall("joint"), strict=True)
         if element.get("type") in HELD
     )
-    return Urdf(path, root, frozenset(links), {joint.name: joint for joint in joints}, held)
+    return Urdf(path, root, frozenset(links), {joint.name: joint for joint in joints}, pinned)
 
 
 def document(path: Path) -> ET.Element:
@@ -167,8 +167,8 @@ def document(path: Path) -> ET.Element:
     """
     robot = parsed(path)
     if _is_xacro(robot):
-        made = f"xacro {path.name} > {path.name.split('.')[0]}.urdf"
-        raise RobotError(f"{path}: this is a xacro, of which a URDF is yet to be made: {made}")
+        command = f"xacro {path.name} > {path.name.split('.')[0]}.urdf"
+        raise RobotError(f"{path}: this is a xacro, of which a URDF is yet to be made: {command}")
     if robot.tag != "robot":
         raise RobotError(f"{path}: the outermost element is <{robot.tag}>; a URDF has <robot>")
     return robot
@@ -306,10 +306,10 @@ def _mimic(path: Path, element: ET.Element, name: str) -> Mimic | None:
     return Mimic(text_of(path, mimic, "joint"), multiplier, offset)
 
 
-def _refuse_twice(path: Path, what: str, names: list[str]) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise RobotError(f"{path}: {what} {', '.join(twice)} declared more than once")
+def _refuse_twice(path: Path, label: str, names: list[str]) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise RobotError(f"{path}: {label} {', '.join(repeated)} declared more than once")
 
 
 def _root(path: Path, links: list[str], joints: list[Joint]) -> str:

@@ -68,12 +68,12 @@ class LabelledRows:
     def get_changelist_form(self, request: HttpRequest, **named: Any) -> Any:
         """Return the form with an aria-label per field, which names field and row."""
         form = super().get_changelist_form(request, **named)  # type: ignore[misc]
-        wanted = getattr(self, "list_editable", ())
+        editable = getattr(self, "list_editable", ())
 
         class Labelled(form):  # type: ignore[misc, valid-type]
             def __init__(self, *given: Any, **more: Any) -> None:
                 super().__init__(*given, **more)
-                for name in set(wanted) & set(self.fields):
+                for name in set(editable) & set(self.fields):
                     field = self.fields[name]
                     field.widget.attrs["aria-label"] = f"{field.label or name} of {self.instance}"
 

@@ -18,46 +18,46 @@ _ONE_SUBSCRIBER = 64  # prefix of IPv6 addresses that belong to one subscriber [
 def client_address(request: HttpRequest) -> str | None:
     """Return the address of the client, None if there is none, as over a Unix socket."""
     named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
-    found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
-    return None if found is None else str(found)
+    address = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
+    return None if address is None else str(address)
 
 
 def lockable_of(request: HttpRequest) -> str | None:
     """Return the address at which names are locked; for IPv6 the network address of the subscriber's /64."""
-    found = _parsed(client_address(request))
-    if isinstance(found, IPv6Address):
-        return str(ip_network((found, _ONE_SUBSCRIBER), strict=False).network_address)
-    return None if found is None else str(found)
+    address = _parsed(client_address(request))
+    if isinstance(address, IPv6Address):
+        return str(ip_network((address, _ONE_SUBSCRIBER), strict=False).network_address)
+    return None if address is None else str(address)
 
 
 def client_key(scope: dict[str, Any]) -> str:
     """Return the key by which ASGI clients share limits: an address, an IPv6 /64 network, or "nowhere"."""
     named = [value.decode("latin-1") for name, value in scope["headers"] if name == b"x-forwarded-for"]
     peer = (scope.get("client") or [None])[0]
-    found = _caller(peer, ",".join(named).split(","), settings.EVA_PROXIES)
-    if isinstance(found, IPv6Address):
-        return str(ip_network((found, _ONE_SUBSCRIBER), strict=False))
-    return "nowhere" if found is None else str(found)
+    address = _caller(peer, ",".join(named).split(","), settings.EVA_PROXIES)
+    if isinstance(address, IPv6Address):
+        return str(ip_network((address, _ONE_SUBSCRIBER), strict=False))
+    return "nowhere" if address is None else str(address)
 
 
 def _caller(
     peer: str | None, named: list[str], proxies: Iterable[IPv4Network | IPv6Network]
 ) -> Address | None:
     """Return the last named address that a trusted proxy has seen itself; any client can invent the ones before it."""
-    here = _parsed(peer)
-    while named and here is not None and any(here in network for network in proxies):
+    address = _parsed(peer)
+    while named and address is not None and any(address in network for network in proxies):
         before = _parsed(named.pop().strip())
         if before is None:
-            return here
-        here = before
-    return here
+            return address
+        address = before
+    return address
 
 
 def _parsed(text: str | None) -> Address | None:
     try:
-        found = ip_address(text or "")
+        address = ip_address(text or "")
     except ValueError:
         return None
-    if isinstance(found, IPv4Address):
-        return found
-    return found.ipv4_mapped or IPv6Address(int(found))  # without a zone id, which no database accepts
+    if isinstance(address, IPv4Address):
+        return address
+    return address.ipv4_mapped or IPv6Address(int(address))  # without a zone id, which no database accepts

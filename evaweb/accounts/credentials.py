@@ -166,8 +166,8 @@ class CredentialCache:
 
     def recall_recent(self, kind: str, secret: str) -> Login | None:
         """Return the cached login if it was verified within COUNTS_S, else None. Makes no query."""
-        known = self.recall(kind, secret)
-        return known if known is not None and self._clock() - known.checked < COUNTS_S else None
+        login = self.recall(kind, secret)
+        return login if login is not None and self._clock() - login.checked < COUNTS_S else None
 
     def forget(self, kind: str, digested: str) -> None:
         """Drop a credential that belongs to no user any more."""
@@ -185,11 +185,11 @@ class CredentialCache:
         """
         for kind, secret in found:
             for remembered in (kind, _of_any_age(kind)):
-                known = self.recall(remembered, secret)
-                if known is not None:
-                    if not self._fresh(known):
+                login = self.recall(remembered, secret)
+                if login is not None:
+                    if not self._fresh(login):
                         self._check(remembered, secret)
-                    return known
+                    return login
         asking = [
             asyncio.create_task(self._resolve_unknown(_of_any_age(kind), secret, share))
             for kind, secret in found
@@ -197,8 +197,8 @@ class CredentialCache:
         try:
             return await _first_known(asking)
         finally:
-            for one in asking:
-                one.cancel()
+            for task in asking:
+                task.cancel()
 
     async def resolve_stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
         """Return kind of credential and user of a stop or halt, cached credentials first; None if all are unknown.
@@ -208,11 +208,11 @@ class CredentialCache:
         """
         fault: LookupOverload | None = None
         for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
-            known = self.recall(kind, secret)
-            if known is None:
+            recalled = self.recall(kind, secret)
+            if recalled is None:
                 login = await self._resolve_unknown(kind, secret, share)
             else:
-                login = known if self._fresh(known) else await self._checked(kind, secret, known)
+                login = recalled if self._fresh(recalled) else await self._checked(kind, secret, recalled)
             if isinstance(login, Login):
                 return kind, login
             if isinstance(login, Unverifiable):
@@ -222,17 +222,17 @@ class CredentialCache:
             raise fault
         return None
 
-    def _fresh(self, known: Login) -> bool:
-        return self._clock() - known.checked < _FRESH_S
+    def _fresh(self, login: Login) -> bool:
+        return self._clock() - login.checked < _FRESH_S
 
-    async def _checked(self, kind: str, secret: str, known: Login) -> Login | None:
+    async def _checked(self, kind: str, secret: str, login: Login) -> Login | None:
         """Return the database's answer on a cached login, or that login if the answer takes over _RECHECK_S."""
         answer = asyncio.wrap_future(self._check(kind, secret))
         await self._wait({answer}, timeout=_RECHECK_S)
         if answer.done() and answer.exception() is None:
             return answer.result()
         answer.add_done_callback(_read)
-        return known
+        return login
 
     def _resolve_unknown(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
         """Start looking up an uncached credential; the coroutine returns its user or why it is unknown."""
@@ -240,21 +240,21 @@ class CredentialCache:
             return self._cached(None)
         return self._cached(self._check(kind, secret, share))
 
-    async def _cached(self, asked: Future[Login | None] | None) -> _Said:
-        if asked is None:
+    async def _cached(self, lookup: Future[Login | None] | None) -> _Said:
+        if lookup is None:
             return None
         came = self._clock()
-        answer = asyncio.wrap_future(asked)
+        answer = asyncio.wrap_future(lookup)
         answer.add_done_callback(_read)
         try:
-            while not asked.done():  # the future of the thread may be done before the event loop notices
+            while not lookup.done():  # the future of the thread may be done before the event loop notices
                 await self._wait({answer}, timeout=remaining_wait(came, self._answered_at, self._clock()))
         except (Unverifiable, LookupOverload) as fault:
             return fault
-        failed = asked.exception()
+        failed = lookup.exception()
         if isinstance(failed, LookupQueueFull):
             return LookupOverload(str(failed))
-        return asked.result() if failed is None else Unverifiable(_AWAY(why=failed))
+        return lookup.result() if failed is None else Unverifiable(_AWAY(why=failed))
 
     def _is_known_as_nobodys(self, key: _Key) -> bool:
         with self._lock:
@@ -267,14 +267,14 @@ class CredentialCache:
         """
         key = ((kind, digest(secret)), share)
         with self._lock:
-            asked = self._asked.get(key)
-            if asked is not None:
-                return asked
+            lookup = self._asked.get(key)
+            if lookup is not None:
+                return lookup
             work = partial(self._query, kind, secret)
             lookups = self._remembered if share is None else self._strangers
-            asked = self._asked[key] = lookups.submit(share, work)
-        asked.add_done_callback(lambda _: self._done(key))
-        return asked
+            lookup = self._asked[key] = lookups.submit(share, work)
+        lookup.add_done_callback(lambda _: self._done(key))
+        return lookup
 
     def _done(self, key: tuple[_Key, str | None]) -> None:
         with self._lock:
@@ -288,9 +288,9 @@ class CredentialCache:
         """
         try:
             with short_lock_wait():
-                for one in (*(now for now, ever in EXPIRED_ALLOWED.items() if ever == kind), kind):
-                    if self.look_up(one, secret) is not None:
-                        return self.recall(one, secret)
+                for allowed in (*(now for now, ever in EXPIRED_ALLOWED.items() if ever == kind), kind):
+                    if self.look_up(allowed, secret) is not None:
+                        return self.recall(allowed, secret)
         except Exception as fault:  # any error means that the credential is unverified
             before = _faults.suffix_if_due(kind)
             if before is not None:
@@ -319,8 +319,8 @@ def remaining_wait(came: float, answered: float, now: float) -> float:
 async def _first_known(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
     """Return the first known user. Raises: Unverifiable at once; LookupOverload if no lookup finds a user."""
     busy: LookupOverload | None = None
-    for one in asyncio.as_completed(asking):
-        answer = await one
+    for completed in asyncio.as_completed(asking):
+        answer = await completed
         if isinstance(answer, Login):
             return answer
         if isinstance(answer, Unverifiable):

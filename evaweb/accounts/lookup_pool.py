@@ -83,8 +83,8 @@ class FairLookupPool(Generic[T]):
                 self._shares[share] = waiting  # at the end of the rotation
             self._waiting -= 1
         try:
-            found = work()
+            result = work()
         except BaseException as fault:
             answer.set_exception(fault)
         else:
-            answer.set_result(found)
+            answer.set_result(result)

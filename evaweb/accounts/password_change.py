@@ -20,14 +20,14 @@ class OwnPasswordForm(PasswordChangeForm):
 
     def clean_old_password(self) -> str:
         """Return the old password. Raises: ValidationError if it is wrong."""
-        given: str = self.cleaned_data["old_password"]
+        password: str = self.cleaned_data["old_password"]
         name = self.user.get_username()
-        if authenticate(self.request, username=name, password=given) != self.user:
+        if authenticate(self.request, username=name, password=password) != self.user:
             raise ValidationError(self.error_messages["password_incorrect"], code="password_incorrect")
         reset(
             username=name, ip=lockable_of(self.request)
         )  # a correct password clears earlier failures, as a login does
-        return given
+        return password
 
 
 class OwnPasswordView(PasswordChangeView):

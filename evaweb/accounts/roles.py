@@ -42,8 +42,8 @@ def role_of(user: Any) -> Role:
     """Return the highest role of a user; a superuser is an admin."""
     if user.is_superuser:
         return Role.ADMIN
-    held = set(user.groups.values_list("name", flat=True))
-    return max((role for role in Role if role.value in held), key=_RANK.__getitem__, default=Role.VIEWER)
+    names = set(user.groups.values_list("name", flat=True))
+    return max((role for role in Role if role.value in names), key=_RANK.__getitem__, default=Role.VIEWER)
 
 
 def require_role(user: Any, role: Role) -> Role:
@@ -70,10 +70,10 @@ def get_or_create_person(name: str) -> Any:
     """Return the account of that name; if there is none, create it deactivated and without a password."""
     from django.contrib.auth import get_user_model  # models cannot be imported before the apps are ready
 
-    person, made = get_user_model().objects.get_or_create(
+    person, created = get_user_model().objects.get_or_create(
         username=name or "unknown", defaults={"is_active": False}
     )
-    if made:
+    if created:
         person.set_unusable_password()
         person.save()
         log.warning("user %s was not in the database: made, deactivated", person.get_username())

@@ -106,8 +106,8 @@ class AccountAdmin(UserAdmin):
 
     def get_form(self, request: HttpRequest, obj: User | None = None, **named: Any) -> Any:
         """Return the form class with the user who edits."""
-        made = super().get_form(request, obj, **named)
-        return type(made.__name__, (made,), {"asking": request.user})
+        form = super().get_form(request, obj, **named)
+        return type(form.__name__, (form,), {"asking": request.user})
 
     def save_model(self, request: HttpRequest, obj: User, form: Any, change: bool) -> None:
         """Save the account, then its role."""

@@ -147,5 +147,5 @@ def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
 
 def openapi_snapshot() -> str:
     """Return the document sorted and indented for readable differences, with a neutral name of the session cookie."""
-    said = json.dumps(api.get_openapi_schema(path_prefix="/api/v1/"), indent=1, sort_keys=True) + "\n"
-    return said.replace(settings.SESSION_COOKIE_NAME, "eva_session_LAB")
+    text = json.dumps(api.get_openapi_schema(path_prefix="/api/v1/"), indent=1, sort_keys=True) + "\n"
+    return text.replace(settings.SESSION_COOKIE_NAME, "eva_session_LAB")

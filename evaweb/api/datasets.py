@@ -74,7 +74,7 @@ class DatasetEpisodeOut(Schema):
 @router.get("", response={200: list[DatasetOut], **FAILURES}, summary="Datasets", url_name="datasets")
 def datasets(request: HttpRequest) -> Any:
     """Return all datasets below the data folder, sorted by name."""
-    return [DatasetOut.of(found) for found in overviews()]
+    return [DatasetOut.of(row) for row in overviews()]
 
 
 @router.get("/one", response={200: DatasetOut, **FAILURES}, summary="One dataset", url_name="dataset")
@@ -98,10 +98,10 @@ def episodes(
     """
     only = {"words": words, "success": success, "result": result, "verdict": verdict}
     try:
-        found = episode_list.list_rows(dataset_orders.full_name(name), **only)
+        rows = episode_list.list_rows(dataset_orders.full_name(name), **only)
     except RecordingError as error:
         raise Conflict(str(error)) from None
-    return [DatasetEpisodeOut.of(row) for row in found]
+    return [DatasetEpisodeOut.of(row) for row in rows]
 
 
 @router.post(

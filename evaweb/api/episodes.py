@@ -154,7 +154,7 @@ class Filters(Schema):
 @router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
 def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging]) -> Any:
     """Return the episodes, newest first."""
-    sight = visibility_for_request(request)
+    visibility = visibility_for_request(request)
     rows = Episode.objects.select_related(*_WITH).prefetch_related("tags")
     rows = rows.order_by("-started_at", "-created_at", "pk")
     if filters.station:
@@ -162,16 +162,16 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
     if filters.damaged is not None:
         rows = rows.exclude(damage=[]) if filters.damaged else rows.filter(damage=[])
     if filters.tag:
-        rows = rows.filter(tags__words=filters.tag) if not sight.named_in(filters.tag) else rows.none()
-    wanted = {
+        rows = rows.filter(tags__words=filters.tag) if not visibility.named_in(filters.tag) else rows.none()
+    lookups = {
         "mode": filters.mode and filters.mode.value,
         "status": filters.status and filters.status.value,
         "dataset": filters.dataset,
     }
     return paging.page(
-        rows.filter(**{name: value for name, value in wanted.items() if value}),
+        rows.filter(**{name: value for name, value in lookups.items() if value}),
         EpisodeOut,
-        sight,
+        visibility,
     )
 
 
@@ -195,9 +195,9 @@ _TABLE = {"schema": {"type": "string", "format": "binary"}}
 )
 def episode_export(request: HttpRequest, uuid: UUID) -> Any:
     """Return raw, smoothed and executed actions step by step; the file's metadata hold manifest and outcome."""
-    found = _found(uuid)
-    visibility_for_request(request).require_episode(found)
-    path = table_file(found.uuid)
+    episode = _found(uuid)
+    visibility_for_request(request).require_episode(episode)
+    path = table_file(episode.uuid)
     return async_to_sync(file_answer)(request, path, CONTENT_TYPE, path.name)
 
 
@@ -228,15 +228,15 @@ def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
     discarded nor failed by a review.
     """
     require_role(request.auth, Role.OPERATOR)
-    found = _found(uuid)
-    if found.status == EpisodeStatus.RECORDING:
+    episode = _found(uuid)
+    if episode.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_PUBLISHED(uuid=uuid))
-    demonstration = getattr(found, "demonstration", None)
+    demonstration = getattr(episode, "demonstration", None)
     if demonstration is not None and not _accepted(demonstration):
         raise Conflict(
             _EPISODE_NOT_ACCEPTED_HAS_LABELLED(uuid=uuid, published_results=" or ".join(PUBLISHED_RESULTS))
         )
-    job = services.request_publish(episode=found)
+    job = services.request_publish(episode=episode)
     if job is None:
         raise Conflict(_EPISODE_SIMULATED_ROBOT_NO_DATASET(uuid=uuid))
     return Status(202, JobOut.of(job, visibility_for_request(request)))
@@ -248,7 +248,7 @@ def _accepted(demonstration: Any) -> bool:
 
 
 def _found(uuid: UUID) -> Episode:
-    found = Episode.objects.select_related(*_WITH).filter(pk=uuid).first()
-    if found is None:
+    episode = Episode.objects.select_related(*_WITH).filter(pk=uuid).first()
+    if episode is None:
         raise NotFound(_EPISODE_DOES_NOT_EXIST(uuid=uuid))
-    return found
+    return episode

@@ -63,9 +63,9 @@ def jobs(
 ) -> Any:
     """Return the jobs, newest first."""
     rows = Job.objects.order_by("-created_at", "-pk")
-    wanted = {"status": status and status.value, "kind": kind, "key": key}
+    lookups = {"status": status and status.value, "kind": kind, "key": key}
     return paging.page(
-        rows.filter(**{name: value for name, value in wanted.items() if value}),
+        rows.filter(**{name: value for name, value in lookups.items() if value}),
         JobOut,
         visibility_for_request(request),
     )

@@ -65,7 +65,7 @@ class PlanOut(Schema):
         before = (
             plan.amends if plan.state == PlanState.DRAFT else None
         )  # a draft has no document that names it yet
-        done = plan_progress(plan)
+        progress = plan_progress(plan)
         plain = ("name", "version", "title", "state", "blind", "commitment")
         times = ("frozen_at", "closed_at", "revealed_at")
         return {
@@ -74,9 +74,9 @@ class PlanOut(Schema):
             "sealed": sealed,
             "owner": plan.owner.get_username(),
             "stations": [station.name for station in plan.stations.all()],
-            "total": done.total,
-            "counted": done.counted,
-            "attempts": done.attempts,
+            "total": progress.total,
+            "counted": progress.counted,
+            "attempts": progress.attempts,
             "question": "" if sealed or (before and is_sealed_for(before, user)) else plan.question,
             "digest": "" if sealed else plan.digest,
             "document": None if sealed else plan.document,
@@ -180,8 +180,8 @@ class CamerasOut(Schema):
     @staticmethod
     def of(check: CameraCheck | None) -> dict[str, Any]:
         """Return the confirmation."""
-        seen = check.seen if check else {}
-        rows = [{"camera": camera, **facts} for camera, facts in seen.items()]
+        views = check.seen if check else {}
+        rows = [{"camera": camera, **facts} for camera, facts in views.items()]
         return {"confirmed": check is not None, "at": check.at if check else None, "cameras": rows}
 
 
@@ -249,9 +249,9 @@ def next_trial(request: HttpRequest, name: str, given: StationIn) -> Any:
     Requires an operator who has confirmed the station's cameras.
     """
     station = station_get(name=given.station)
-    found = plan_get(name=name, user=request.auth)
-    handout = bench.allocate_checked_trial(user=request.auth, station=station, plan=found)
-    seen = visibility_for_request(request)
+    plan = plan_get(name=name, user=request.auth)
+    handout = bench.allocate_checked_trial(user=request.auth, station=station, plan=plan)
+    visibility = visibility_for_request(request)
     return Status(
         201,
         {
@@ -259,7 +259,7 @@ def next_trial(request: HttpRequest, name: str, given: StationIn) -> Any:
             "number": handout.number,
             "attempt": handout.trial.attempt,
             "reason": "the attempt before does not count" if handout.reason else "",
-            "trial": TrialDetail.of(trials.trial_get(id=handout.trial_id), seen),
+            "trial": TrialDetail.of(trials.trial_get(id=handout.trial_id), visibility),
         },
     )
 
@@ -275,9 +275,9 @@ def release_slots(request: HttpRequest, name: str, given: ReleaseSlotsIn) -> Any
 
     Requires an operator.
     """
-    found, station = plan_get(name=name, user=request.auth), station_get(name=given.station)
+    plan, station = plan_get(name=name, user=request.auth), station_get(name=given.station)
     return {
-        "freed": allocation.release_slots(user=request.auth, plan=found, station=station, reason=given.reason)
+        "freed": allocation.release_slots(user=request.auth, plan=plan, station=station, reason=given.reason)
     }
 
 
@@ -286,8 +286,8 @@ def release_slots(request: HttpRequest, name: str, given: ReleaseSlotsIn) -> Any
 )
 def close(request: HttpRequest, name: str, given: Reason) -> Any:
     """Stop handing out trials of the plan. Requires its owner or an administrator."""
-    found = plan_get(name=name, user=request.auth)
-    return PlanOut.of(services.close_plan(user=request.auth, plan=found, reason=given.reason), request.auth)
+    plan = plan_get(name=name, user=request.auth)
+    return PlanOut.of(services.close_plan(user=request.auth, plan=plan, reason=given.reason), request.auth)
 
 
 @router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
@@ -296,9 +296,9 @@ def unblind(request: HttpRequest, name: str) -> Any:
 
     From then on the caller can run none of the plan's trials.
     """
-    found = plan_get(name=name, user=request.auth)
-    record_unblinding(found, request.auth)
-    return PlanOut.of(found, request.auth)
+    plan = plan_get(name=name, user=request.auth)
+    record_unblinding(plan, request.auth)
+    return PlanOut.of(plan, request.auth)
 
 
 @router.post(
@@ -306,8 +306,8 @@ def unblind(request: HttpRequest, name: str) -> Any:
 )
 def reveal(request: HttpRequest, name: str) -> Any:
     """Publish the checkpoint of every trial; this cannot be undone. Requires the plan's owner or an administrator."""
-    found = plan_get(name=name, user=request.auth)
-    return PlanOut.of(services.reveal_plan(user=request.auth, plan=found), request.auth)
+    plan = plan_get(name=name, user=request.auth)
+    return PlanOut.of(services.reveal_plan(user=request.auth, plan=plan), request.auth)
 
 
 @router.get(
@@ -348,8 +348,8 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)
         position = trials.position_get(scene=scene, number=given.position or 0)
-    taken = bench.record_references(user=request.auth, station=station_get(name=name), position=position)
-    return Status(201, [ReferenceOut.of(row) for row in taken])
+    rows = bench.record_references(user=request.auth, station=station_get(name=name), position=position)
+    return Status(201, [ReferenceOut.of(row) for row in rows])
 
 
 @router.post(
@@ -376,16 +376,16 @@ def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
 )
 def bench_match(request: HttpRequest, id: int) -> Any:
     """Return how well each camera with a reference of the trial's position matches it now; nothing is stored."""
-    seen = bench.current_matches(trial=trials.trial_get(id=id))
+    matches = bench.current_matches(trial=trials.trial_get(id=id))
     return [
         {
-            "camera": one.camera,
-            "reference": one.reference.picture,
-            "match": one.match,
-            "regions": one.regions,
+            "camera": match.camera,
+            "reference": match.reference.picture,
+            "match": match.match,
+            "regions": match.regions,
         }
-        for one in seen
-        if one.reference
+        for match in matches
+        if match.reference
     ]
 
 
@@ -400,8 +400,8 @@ def record_layout(request: HttpRequest, id: int, given: LayoutIn) -> Any:
 
     Requires an operator.
     """
-    taken = bench.record_layout(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
-    return Status(201, [_seen(row) for row in taken])
+    rows = bench.record_layout(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
+    return Status(201, [_seen(row) for row in rows])
 
 
 def _seen(row: Achieved) -> dict[str, Any]:

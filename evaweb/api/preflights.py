@@ -47,7 +47,7 @@ class PreflightOut(Schema):
     @staticmethod
     def of(row: Preflight, user: Any) -> dict[str, Any]:
         """Return the preflight with this user's visibility."""
-        seen = visible_preflight(row, user)
+        visible = visible_preflight(row, user)
         plain = ("by", "status", "verdict", "asked_at", "ended_at")
         return {
             **{name: getattr(row, name) for name in plain},
@@ -55,9 +55,9 @@ class PreflightOut(Schema):
             "checkpoint": row.checkpoint.name,
             "station": row.station.name,
             "asked_by": row.user.get_username() if row.user else "",
-            "reason": seen.reason,
-            "hidden": seen.hidden,
-            "report": seen.report,
+            "reason": visible.reason,
+            "hidden": visible.hidden,
+            "report": visible.report,
         }
 
 
@@ -77,10 +77,10 @@ class PreflightFilters(Schema):
 @router.get("", response={200: Page[PreflightOut], **FAILURES}, summary="Preflights", url_name="preflights")
 def preflights(request: HttpRequest, filters: Query[PreflightFilters], paging: Query[Paging]) -> Any:
     """Return the preflights, newest first."""
-    seen = visibility_for_request(request)
-    checkpoint = checkpoint_get(name=filters.checkpoint, sight=seen) if filters.checkpoint else None
+    visibility = visibility_for_request(request)
+    checkpoint = checkpoint_get(name=filters.checkpoint, sight=visibility) if filters.checkpoint else None
     return paging.page(
-        selectors.preflight_list(checkpoint=checkpoint, sight=seen), PreflightOut, request.auth
+        selectors.preflight_list(checkpoint=checkpoint, sight=visibility), PreflightOut, request.auth
     )
 
 

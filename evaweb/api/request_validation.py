@@ -62,10 +62,10 @@ def _parameters(view: Any) -> list[str]:
     return [name for model in models for name in model.__ninja_flatten_map__]
 
 
-def _check(given: set[str], known: list[str]) -> None:
-    unknown = ", ".join(sorted(given - set(known)))
+def _check(names: set[str], allowed: list[str]) -> None:
+    unknown = ", ".join(sorted(names - set(allowed)))
     if unknown:
-        raise UnknownParameter(_UNKNOWN_PARAMETER(unknown=unknown, known=", ".join(known) or "none"))
+        raise UnknownParameter(_UNKNOWN_PARAMETER(unknown=unknown, known=", ".join(allowed) or "none"))
 
 
 class TooLong(EvaError):
@@ -90,25 +90,25 @@ class BoundedParser(Parser):
         if not (request.path.endswith("/commands") and pressing.parse_json_press(request.body, "kind")):
             require_role(request.auth, body_limit_for(request.path).role)
         try:
-            given = _read(request)
-            return _without_unknown(given) if request.path.endswith("/commands") else given
+            body = _read(request)
+            return _without_unknown(body) if request.path.endswith("/commands") else body
         except (EvaError, bounded.UnreadableDocument):
             if pressed:
                 return {}
             raise
 
 
-def _without_unknown(given: Any) -> Any:
+def _without_unknown(body: Any) -> Any:
     """Return the body; the body of a stop without its unknown fields, because they must not prevent the stop."""
     from evaweb.api.stations import CommandIn  # imported here: stations is validated by this module
 
-    if not _stops(given):
-        return given
-    return {name: value for name, value in given.items() if name in CommandIn.model_fields}
+    if not _stops(body):
+        return body
+    return {name: value for name, value in body.items() if name in CommandIn.model_fields}
 
 
-def _stops(given: Any) -> bool:
-    kind = given.get("kind") if isinstance(given, dict) else None
+def _stops(body: Any) -> bool:
+    kind = body.get("kind") if isinstance(body, dict) else None
     return isinstance(kind, str) and kind in STOPPING
 
 
@@ -116,22 +116,22 @@ def _read(request: HttpRequest) -> Any:
     post = body_limit_for(request.path)
     if len(request.body) > post.largest:
         raise TooLong(_BODY_TOO_LONG(count=len(request.body), largest=post.largest))
-    given = bounded.parse_json(request.body, "the body", most=post.values)
-    if b"\\u" in request.body and not _stops(given):
-        for place, text in _iter_strings(given):
+    body = bounded.parse_json(request.body, "the body", most=post.values)
+    if b"\\u" in request.body and not _stops(body):
+        for place, text in _iter_strings(body):
             if not is_text(text):
                 raise EvaError(_NO_TEXT(place=place or "body", text=text))
-    return given
+    return body
 
 
-def _iter_strings(given: Any, place: str = "") -> Iterator[tuple[str, str]]:
+def _iter_strings(item: Any, place: str = "") -> Iterator[tuple[str, str]]:
     """Yield every string, field names included, with its place."""
-    if isinstance(given, str):
-        yield place, given
-    elif isinstance(given, list):
-        for value in given:
+    if isinstance(item, str):
+        yield place, item
+    elif isinstance(item, list):
+        for value in item:
             yield from _iter_strings(value, place)
-    elif isinstance(given, dict):
-        for name, value in given.items():
+    elif isinstance(item, dict):
+        for name, value in item.items():
             yield place, name
             yield from _iter_strings(value, f"{place}.{name}".strip("."))

@@ -49,12 +49,12 @@ class Paging(Schema):
 
     def page(self, rows: QuerySet[Any], shape: Any, *seen: Any) -> dict[str, Any]:
         """Return total, limit, offset and the items of one page, converted by `shape.of(row, *seen)`."""
-        found = rows[self.offset : self.offset + self.limit]
+        selected = rows[self.offset : self.offset + self.limit]
         return {
             "total": rows.count(),
             "limit": self.limit,
             "offset": self.offset,
-            "items": [shape.of(row, *seen) for row in found],
+            "items": [shape.of(row, *seen) for row in selected],
         }
 
 
@@ -63,14 +63,14 @@ FAILURES = {frozenset({400, 401, 403, 404, 409, 422, 503}): ErrorOut}
 
 def describe_errors(faults: Sequence[Mapping[str, Any]]) -> str:
     """Return pydantic's errors as one text: for each the place, the given value, and what is allowed."""
-    said = [_sentence(fault) for fault in faults[:_MOST_SAID]]
-    more = len(faults) - len(said)
-    return "; ".join(said) + (f"; and {more} more" if more > 0 else "")
+    sentences = [_sentence(fault) for fault in faults[:_MOST_SAID]]
+    more = len(faults) - len(sentences)
+    return "; ".join(sentences) + (f"; and {more} more" if more > 0 else "")
 
 
 def _sentence(fault: Mapping[str, Any]) -> str:
     place = ".".join(str(part) for part in fault["loc"] if part not in _WRAPPERS) or "body"
-    given = fault["input"]
-    shown = f" = {given!r:.80}" if isinstance(given, str | int | float) else ""
+    value = fault["input"]
+    value_text = f" = {value!r:.80}" if isinstance(value, str | int | float) else ""
     msg = "unknown field" if fault["type"] == "extra_forbidden" else fault["msg"]
-    return f"{place}{shown}: {msg}"
+    return f"{place}{value_text}: {msg}"

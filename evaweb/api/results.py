@@ -208,7 +208,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilt
         "planned": planned_document(result),
         "caveats": result.caveats,
         **result.analysis.document,
-        "corrected": {name: write_proportion(found) for name, found in result.corrected.items()},
+        "corrected": {name: write_proportion(rate) for name, rate in result.corrected.items()},
         "notes": list(result.analysis.notes),
         "agreement": result.agreement,
         "judges": result.judges,
@@ -243,28 +243,28 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
     """
     plan = _seen(request, name, version).plan
     user: Any = request.auth  # type: ignore[attr-defined]
-    found = (compare_with_real(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
+    matched = (compare_with_real(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
     return [
         {
-            "plan": one["plan"].name,
-            "version": one["plan"].version,
+            "plan": pair["plan"].name,
+            "version": pair["plan"].version,
             "checkpoints": {
                 checkpoint: {"real": write_proportion(real), "simulated": write_proportion(played)}
-                for checkpoint, real, played in one["rates"]
+                for checkpoint, real, played in pair["rates"]
             },
-            "rank_correlation": one["rank_correlation"],
-            "rank_violation": one["rank_violation"],
+            "rank_correlation": pair["rank_correlation"],
+            "rank_violation": pair["rank_violation"],
             "differences": [
                 {
                     "first": first,
                     "second": second,
-                    "value": said and said.value,
-                    "interval": said and [said.interval.low, said.interval.high],
+                    "value": difference and difference.value,
+                    "interval": difference and [difference.interval.low, difference.interval.high],
                 }
-                for first, second, said in one["differences"]
+                for first, second, difference in pair["differences"]
             ],
         }
-        for one in found
+        for pair in matched
     ]
 
 
@@ -295,10 +295,10 @@ def checkpoint(
 ) -> Any:
     """Return the rates, scores, milestones and times of a checkpoint."""
     analysis = _seen(request, name, version, only).analysis
-    found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
-    if found is None:
+    row = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
+    if row is None:
         raise NotFound(_NO_TRIAL_COUNTS_THERE_TRIALS(checkpoint=checkpoint, names=_names(analysis)))
-    return found.document
+    return row.document
 
 
 @router.get(
@@ -312,10 +312,10 @@ def comparison(
 ) -> Any:
     """Return difference, tests and evidence of the first checkpoint minus the second."""
     analysis = _seen(request, name, version, only).analysis
-    found = analysis.comparison_of(first, second)
-    if found is None:
+    row = analysis.comparison_of(first, second)
+    if row is None:
         raise NotFound(_NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=_names(analysis)))
-    return found.document
+    return row.document
 
 
 @router.get(
@@ -420,18 +420,18 @@ def _seen(request: Any, name: str, version: int, only: TrialFilters | None = Non
     """Return the result of the plan's selected trials, if the user may see it."""
     plan = plan_get(name=name, version=version)
     require_visible_results(plan, request.auth)
-    given = only.model_dump() if only else {}
-    return PlanResult(plan).select(given) if any(given.values()) else PlanResult(plan)
+    filters = only.model_dump() if only else {}
+    return PlanResult(plan).select(filters) if any(filters.values()) else PlanResult(plan)
 
 
 def _rows(
-    request: HttpRequest, plan: Plan, what: str, rows: Any, shape: Any, paging: Paging, format: Format
+    request: HttpRequest, plan: Plan, label: str, rows: Any, shape: Any, paging: Paging, format: Format
 ) -> Any:
     if format == "json":
         return paging.page(rows, shape)
     columns = {name: field.annotation for name, field in shape.model_fields.items()}
     pages = in_pages(map(shape.of, rows.iterator(chunk_size=1000)))
-    return table_response(request, f"{plan.name}-v{plan.version}-{what}", columns, pages, format)
+    return table_response(request, f"{plan.name}-v{plan.version}-{label}", columns, pages, format)
 
 
 def _names(analysis: Analysis) -> str:

@@ -170,8 +170,8 @@ def next_unreviewed(request: HttpRequest, after: UUID | None = None) -> Any:
     """Return the next unreviewed episode after the episode `after` in the list, newest first; from the top if none
     follows.
     """
-    found, waiting = selectors.unreviewed_next(after=after)
-    return {"episode": found.uuid if found else None, "waiting": waiting}
+    episode, waiting = selectors.unreviewed_next(after=after)
+    return {"episode": episode.uuid if episode else None, "waiting": waiting}
 
 
 @router.get(
@@ -235,8 +235,8 @@ def remove_segment(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
 @router.get("/reviews/tags", response={200: list[TagOut], **FAILURES}, summary="Tags", url_name="tags")
 def tags(request: HttpRequest) -> Any:
     """Return all tags of episodes in alphabetical order."""
-    found = tag_counts(sight=visibility_for_request(request))
-    return [{"words": words, "episodes": episodes} for words, episodes in found.items()]
+    counts = tag_counts(sight=visibility_for_request(request))
+    return [{"words": text, "episodes": episodes} for text, episodes in counts.items()]
 
 
 @router.post(
@@ -275,8 +275,8 @@ def request_quality(request: HttpRequest, uuid: UUID) -> Any:
     Requires an operator. The job reports the progress.
     """
     require_role(request.auth, Role.OPERATOR)
-    asked = services.request_quality_check(episode=episode_get(uuid=uuid))
-    return Status(202, JobOut.of(asked, visibility_for_request(request)))
+    job = services.request_quality_check(episode=episode_get(uuid=uuid))
+    return Status(202, JobOut.of(job, visibility_for_request(request)))
 
 
 def _said(request: Any, uuid: UUID) -> dict[str, Any]:

@@ -114,9 +114,9 @@ class SessionDetail(SessionOut):
             ],
             "episodes": [
                 {
-                    **{name: getattr(one, name) for name in ("result", "note", "discarded")},
+                    **{name: getattr(demonstration, name) for name in ("result", "note", "discarded")},
                     **{
-                        name: getattr(one.episode, name)
+                        name: getattr(demonstration.episode, name)
                         for name in (
                             "status",
                             "frames",
@@ -126,9 +126,9 @@ class SessionDetail(SessionOut):
                             "dataset_index",
                         )
                     },
-                    "episode": one.pk,
+                    "episode": demonstration.pk,
                 }
-                for one in selectors.demonstrations_of(session=session)
+                for demonstration in selectors.demonstrations_of(session=session)
             ],
         }
 
@@ -214,12 +214,12 @@ def queue(request: HttpRequest, uuid: UUID) -> Any:
 
     `POST /jobs/ID/retry` retries a failed one.
     """
-    found = session_queue(session=selectors.session_get(uuid=uuid))
+    work = session_queue(session=selectors.session_get(uuid=uuid))
     return {
-        "done": found.done,
-        "total": found.total,
-        "left_s": found.left_s,
-        "items": [QueuedOut.of(item, visibility_for_request(request)) for item in found.items],
+        "done": work.done,
+        "total": work.total,
+        "left_s": work.left_s,
+        "items": [QueuedOut.of(item, visibility_for_request(request)) for item in work.items],
     }
 
 
@@ -234,8 +234,8 @@ def open_session(request: HttpRequest, name: str, given: SessionIn) -> Any:
 
     Requires an operator, and that no other user commands the station.
     """
-    made = services.open_session(user=request.auth, station=station_get(name=name), **given.model_dump())
-    return Status(201, SessionOut.of(made))
+    session = services.open_session(user=request.auth, station=station_get(name=name), **given.model_dump())
+    return Status(201, SessionOut.of(session))
 
 
 @router.post(
@@ -268,8 +268,8 @@ def resume_session(request: HttpRequest, uuid: UUID) -> Any:
 )
 def set_target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
     """Set the number of episodes wanted."""
-    found = selectors.session_get(uuid=uuid)
-    return SessionOut.of(services.set_session_target(user=request.auth, session=found, target=given.target))
+    session = selectors.session_get(uuid=uuid)
+    return SessionOut.of(services.set_session_target(user=request.auth, session=session, target=given.target))
 
 
 @router.post(
@@ -280,6 +280,6 @@ def set_target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
 )
 def publish(request: HttpRequest, uuid: UUID, given: PublishIn) -> Any:
     """Publish the accepted episodes that are in no dataset yet; returns the jobs."""
-    found = selectors.session_get(uuid=uuid)
-    asked = services.publish_session(user=request.auth, session=found, **given.model_dump())
-    return Status(202, [JobOut.of(job, visibility_for_request(request)) for job in asked])
+    session = selectors.session_get(uuid=uuid)
+    jobs = services.publish_session(user=request.auth, session=session, **given.model_dump())
+    return Status(202, [JobOut.of(job, visibility_for_request(request)) for job in jobs])

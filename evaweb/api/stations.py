@@ -89,7 +89,7 @@ class LeaseOut(Schema):
             "user": holder_display_name(lease.holder) if lease else "",
             "epoch": lease.epoch if lease else 0,
             "granted_at": lease.granted_at if lease else None,
-            "requests": [RequestOut.of(asked) for asked in selectors.request_list(station=station)],
+            "requests": [RequestOut.of(request) for request in selectors.request_list(station=station)],
         }
 
 
@@ -226,17 +226,17 @@ def stations(request: HttpRequest, inactive: bool = False) -> Any:
 @router.get("/{name}", response={200: StationDetail, **FAILURES}, summary="One station", url_name="station")
 def station(request: HttpRequest, name: str) -> Any:
     """Return a station with its newest snapshot; `gone` says why there is none."""
-    found = selectors.station_get(name=name)
+    row = selectors.station_get(name=name)
     snapshot, gone = None, ""
     try:
         snapshot = connection_to(name).status()
     except StationGone as fault:
         gone = str(fault)
-    seen, unfinished = visibility_for_request(request), trial_selectors.trial_open(found)
-    if snapshot is not None and seen.redacts_snapshot(name, snapshot):
-        snapshot = veil.redact_state(snapshot, seen)
-    trial = TrialDetail.of(trial_selectors.trial_get(id=unfinished.pk), seen) if unfinished else None
-    return {**StationOut.of(found), "snapshot": snapshot, "gone": gone, "trial": trial}
+    visibility, unfinished = visibility_for_request(request), trial_selectors.trial_open(row)
+    if snapshot is not None and visibility.redacts_snapshot(name, snapshot):
+        snapshot = veil.redact_state(snapshot, visibility)
+    trial = TrialDetail.of(trial_selectors.trial_get(id=unfinished.pk), visibility) if unfinished else None
+    return {**StationOut.of(row), "snapshot": snapshot, "gone": gone, "trial": trial}
 
 
 @router.post(
@@ -244,23 +244,23 @@ def station(request: HttpRequest, name: str) -> Any:
 )
 def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
     """Claim, request, hand over, move or give up the station's lease; returns its state afterwards."""
-    found, user, page = selectors.station_get(name=name), request.auth, given.page
+    row, user, page = selectors.station_get(name=name), request.auth, given.page
     if given.action == "claim":
-        leases.claim(user=user, station=found, page=page)
+        leases.claim(user=user, station=row, page=page)
     elif given.action == "give_up":
-        leases.release(user=user, station=found, page=page)
+        leases.release(user=user, station=row, page=page)
     elif given.action == "request":
-        leases.request_handover(user=user, station=found, page=page)
+        leases.request_handover(user=user, station=row, page=page)
     elif given.action == "withdraw":
-        leases.withdraw_request(user=user, station=found)
+        leases.withdraw_request(user=user, station=row)
     elif given.action == "move":
-        leases.move(user=user, station=found, page=page)
+        leases.move(user=user, station=row, page=page)
     elif given.action == "take":
-        leases.take_over(user=user, station=found, page=page, reason=given.reason)
+        leases.take_over(user=user, station=row, page=page, reason=given.reason)
     else:
         answer = leases.hand_over if given.action == "hand_over" else leases.decline_request
-        answer(user=user, station=found, page=page, request=_request_of(given))
-    return LeaseOut.of(found)
+        answer(user=user, station=row, page=page, request=_request_of(given))
+    return LeaseOut.of(row)
 
 
 @router.post(
@@ -274,31 +274,31 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
 
     The same uuid again gets the first answer.
     """
-    found, seen = selectors.station_get(name=name), visibility_for_request(request)
+    target, visibility = selectors.station_get(name=name), visibility_for_request(request)
     order = given.model_dump(exclude=set(_NAMED))
     named = [name for name in _NAMED if getattr(given, name) is not None]
     if len(named) > 1:
         raise EvaError(_SEVERAL_NAMED(named=" and ".join(named)))
     if given.session is not None:
         session = session_get(uuid=given.session)
-        if session.station_id != found.pk:
+        if session.station_id != target.pk:
             raise EvaError(
-                _SESSION_OF_ANOTHER(session=session, station=session.station.name, other=found.name)
+                _SESSION_OF_ANOTHER(session=session, station=session.station.name, other=target.name)
             )
         row = session_command(user=request.auth, session=session, **order)
     elif given.checkpoint is not None:
-        checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint, sight=seen)
-        row = checkpoint_command(user=request.auth, station=found, checkpoint=checkpoint, **order)
+        checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint, sight=visibility)
+        row = checkpoint_command(user=request.auth, station=target, checkpoint=checkpoint, **order)
     elif given.replay is not None:
-        row = replay_command(user=request.auth, station=found, **given.replay.model_dump(), **order)
+        row = replay_command(user=request.auth, station=target, **given.replay.model_dump(), **order)
     elif given.trial is None:
-        row = commands.issue_command(user=request.auth, station=found, **order)
+        row = commands.issue_command(user=request.auth, station=target, **order)
     else:
         trial = trial_selectors.trial_get(id=given.trial)
-        if trial.station_id != found.pk:
-            raise EvaError(_TRIAL_OF_ANOTHER(trial=trial.pk, station=trial.station.name, other=found.name))
+        if trial.station_id != target.pk:
+            raise EvaError(_TRIAL_OF_ANOTHER(trial=trial.pk, station=trial.station.name, other=target.name))
         row = trial_command(user=request.auth, trial=trial, **order)
-    return Status(HTTP_OF[CommandStatus(row.status)], _command_out(row, seen))
+    return Status(HTTP_OF[CommandStatus(row.status)], _command_out(row, visibility))
 
 
 @router.post(
@@ -317,8 +317,8 @@ def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     ).result()
     place = Station(name=name)
     commands.record_estop(user=user, station=place, why=given.why, uuid=identity, answer=answer, at=at)
-    said = {name: getattr(answer, name) for name in ("status", "allowed", "data")}
-    return Status(HTTP_OF[answer.status], {"uuid": identity, **said, **reasoned(answer.reason)})
+    fields = {name: getattr(answer, name) for name in ("status", "allowed", "data")}
+    return Status(HTTP_OF[answer.status], {"uuid": identity, **fields, **reasoned(answer.reason)})
 
 
 @router.post(
@@ -327,7 +327,7 @@ def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
 def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
     """Prepare the next trial of a checkpoint at a position, or the repetition of one that does not count."""
     scene = trial_selectors.scene_get(name=given.scene)
-    made = services.prepare_trial(
+    trial = services.prepare_trial(
         user=request.auth,
         station=selectors.station_get(name=name),
         scene=scene,
@@ -337,18 +337,20 @@ def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
         ),
         seed=given.seed,
     )
-    return Status(201, TrialDetail.of(trial_selectors.trial_get(id=made.pk), visibility_for_request(request)))
+    return Status(
+        201, TrialDetail.of(trial_selectors.trial_get(id=trial.pk), visibility_for_request(request))
+    )
 
 
-def _request_of(given: LeaseIn) -> int:
-    if given.request is None:
-        raise EvaError(_REQUEST_MISSING(action=given.action))
-    return given.request
+def _request_of(body: LeaseIn) -> int:
+    if body.request is None:
+        raise EvaError(_REQUEST_MISSING(action=body.action))
+    return body.request
 
 
-def _command_out(row: Command, sight: Visibility) -> dict[str, Any]:
+def _command_out(row: Command, visibility: Visibility) -> dict[str, Any]:
     reason, data = row.reason, row.data
-    if sight.redacts_events(row.station.name) or sight.redacts_snapshot(row.station.name, row.args):
-        reason, data = sight.redact_text(row.reason), veil.redact_answer(row.data)
-    known = {"uuid": row.pk, "status": row.status, "allowed": row.allowed}
-    return {**known, **reasoned(reason), "data": data}
+    if visibility.redacts_events(row.station.name) or visibility.redacts_snapshot(row.station.name, row.args):
+        reason, data = visibility.redact_text(row.reason), veil.redact_answer(row.data)
+    fields = {"uuid": row.pk, "status": row.status, "allowed": row.allowed}
+    return {**fields, **reasoned(reason), "data": data}

@@ -103,40 +103,40 @@ class StopGateway:
         self._application, self._web_port = application, web_port
 
     async def __call__(self, scope: dict[str, Any], receive: _Receive, send: Any) -> None:
-        asked = _PATH.fullmatch(scope["path"])
-        if asked is None or (scope["method"], asked[2]) not in _ASKED:
+        match = _PATH.fullmatch(scope["path"])
+        if match is None or (scope["method"], match[2]) not in _ASKED:
             await self._application(scope, receive, send)
             return
-        presses = (scope["method"], asked[2]) == ("POST", "estop")
+        presses = (scope["method"], match[2]) == ("POST", "estop")
         if not presses and self._web_port is not None and not _is_known(_header(scope, b"host")):
             await _send(send, 400, refusal(_UNKNOWN_HOST(host=_header(scope, b"host")[:200])))
             return
         body = await _body(receive)
         if body is None:
             return
-        told = list(self._cors_headers(scope))
+        headers = list(self._cors_headers(scope))
         if scope["method"] == "OPTIONS":
-            await _send(send, 200, {}, [*told, *_PREFLIGHT])
+            await _send(send, 200, {}, [*headers, *_PREFLIGHT])
             return
         try:
-            answered = await self._answered(scope, asked, body)
+            answer = await self._answered(scope, match, body)
         except EvaError as fault:
-            answered = (fault.status, refusal(str(fault)))
+            answer = (fault.status, refusal(str(fault)))
         except LookupOverload as fault:
-            answered = (503, refusal(_STOP_AGAIN(why=fault)))
-            told.append(_BUSY)
+            answer = (503, refusal(_STOP_AGAIN(why=fault)))
+            headers.append(_BUSY)
         except Exception as fault:  # whatever fails, the caller must get an answer
             log.exception("a stop at %s was not answered", scope["path"][:200])
-            answered = (500, refusal(f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"))
-        if answered is None:
+            answer = (500, refusal(f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"))
+        if answer is None:
             await self._application(scope, _replay_body(body, receive), send)
         else:
-            await _send(send, *answered, told)
+            await _send(send, *answer, headers)
 
-    async def _answered(self, scope: dict[str, Any], asked: re.Match[str], body: bytes) -> Answered | None:
+    async def _answered(self, scope: dict[str, Any], match: re.Match[str], body: bytes) -> Answered | None:
         if scope["method"] == "GET":
             return await self._ready(scope)
-        return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
+        return await _answered(self._as_of_here(scope), match[1], match[2], body)
 
     async def _ready(self, scope: dict[str, Any]) -> Answered:
         """Return the caller's name.
@@ -168,34 +168,34 @@ class StopGateway:
         origin = _header(scope, b"origin")
         if self._web_port is None or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
             return scope
-        others = [(name, value) for name, value in scope["headers"] if name != b"origin"]
-        here = f"{scope['scheme']}://{host}".encode("latin-1")
-        return {**scope, "headers": [*others, (b"origin", here)]}
+        further = [(name, value) for name, value in scope["headers"] if name != b"origin"]
+        own_origin = f"{scope['scheme']}://{host}".encode("latin-1")
+        return {**scope, "headers": [*further, (b"origin", own_origin)]}
 
 
 def stop_application(web_port: int) -> StopGateway:
     """Return the application of the process for stops, for pages of the web at that port."""
-    said = refusal(_STOPS_ALONE(port=web_port))
+    answer = refusal(_STOPS_ALONE(port=web_port))
 
     async def nothing_else(scope: dict[str, Any], receive: _Receive, send: Any) -> None:
-        await _send(send, 404, said)
+        await _send(send, 404, answer)
 
     return StopGateway(nothing_else, web_port)
 
 
-async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes) -> Answered | None:
+async def _answered(scope: dict[str, Any], station: str, action: str, body: bytes) -> Answered | None:
     """Return status and answer; None for a command that is not a stop."""
-    if what == "estop":
+    if action == "estop":
         return await _estop(scope, station, _parse_body(body))
     press = pressing.parse_json_press(body, "kind")
     if press is not None:
         return await _estop(scope, station, press)
-    said = _parse_body(body) if len(body) <= _LARGEST else {}
-    return await _stop(scope, station, said, body) if said.get("kind") in commands.STOPPING else None
+    fields = _parse_body(body) if len(body) <= _LARGEST else {}
+    return await _stop(scope, station, fields, body) if fields.get("kind") in commands.STOPPING else None
 
 
-async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -> Answered:
-    given, at = EStopIn(uuid=said.get("uuid"), why=pressing.json_reason(said)), timezone.now()
+async def _estop(scope: dict[str, Any], station: str, fields: Mapping[str, Any]) -> Answered:
+    parsed, at = EStopIn(uuid=fields.get("uuid"), why=pressing.json_reason(fields)), timezone.now()
     unverified, username, user = "", UNVERIFIED, None
     try:
         login = await _resolve_presser(scope)
@@ -204,17 +204,17 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
         login_audit.estop_unverified(station, fault)
     else:
         username, user = login.username, login.account
-    uuid = given.uuid or uuid4()
-    press = stops.press_estop(station=station, username=username, why=given.why, uuid=uuid)
+    uuid = parsed.uuid or uuid4()
+    press = stops.press_estop(station=station, username=username, why=parsed.why, uuid=uuid)
     answer = await asyncio.wrap_future(press)
     place = Station(name=station)
     commands.record_estop(
-        user=user, station=place, why=given.why, uuid=uuid, answer=answer, at=at, unverified=unverified
+        user=user, station=place, why=parsed.why, uuid=uuid, answer=answer, at=at, unverified=unverified
     )
     return HTTP_OF[answer.status], _answer_body(str(uuid), answer, answer.data)
 
 
-async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], body: bytes) -> Answered:
+async def _stop(scope: dict[str, Any], station: str, fields: Mapping[str, Any], body: bytes) -> Answered:
     at = timezone.now()
     kind, login = await _resolve_stopper(scope)
     if kind == SESSION:
@@ -222,19 +222,19 @@ async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], bo
     if login.role is Role.VIEWER:
         raise NotAllowed(stops.refused_to_a_viewer(login.username))
     try:
-        given = CommandIn(**said)
+        parsed = CommandIn(**fields)
     except ValidationError as fault:
         raise Refused(describe_errors(fault.errors(include_url=False)), 422) from None
-    named = {"kind": given.kind, "page": given.page, "epoch": given.epoch, "uuid": given.uuid}
+    named = {"kind": parsed.kind, "page": parsed.page, "epoch": parsed.epoch, "uuid": parsed.uuid}
     order = stops.stop_command(username=login.username, **named)
     answer = await asyncio.wrap_future(stops.request_stop(order, station))
     commands.record_stop(user=login.account, station=Station(name=station), answer=answer, at=at, **named)
-    return HTTP_OF[answer.status], _answer_body(str(given.uuid), answer, veil.redact_answer(answer.data))
+    return HTTP_OF[answer.status], _answer_body(str(parsed.uuid), answer, veil.redact_answer(answer.data))
 
 
 def _answer_body(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str, Any]:
-    said = {"status": answer.status.value, "reason": answer.reason, **identity(answer.reason)}
-    return {"uuid": uuid, **said, "allowed": answer.allowed, "data": data}
+    fields = {"status": answer.status.value, "reason": answer.reason, **identity(answer.reason)}
+    return {"uuid": uuid, **fields, "allowed": answer.allowed, "data": data}
 
 
 async def _resolve_presser(scope: dict[str, Any]) -> Login:
@@ -245,10 +245,10 @@ async def _resolve_presser(scope: dict[str, Any]) -> Login:
         Unverifiable: If the database does not answer.
         LookupOverload: If this client's share of lookups is used up.
     """
-    found = _credentials(scope)
-    login = await credentials.resolve_presser(found, client_key(scope))
+    candidates = _credentials(scope)
+    login = await credentials.resolve_presser(candidates, client_key(scope))
     if login is None:
-        raise _unknown_credentials(found, scope)
+        raise _unknown_credentials(candidates, scope)
     return login
 
 
@@ -259,18 +259,18 @@ async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
         Refused: If they are missing, unknown, or cannot be verified.
         LookupOverload: If this client's share of lookups is used up.
     """
-    found = _credentials(scope)
+    candidates = _credentials(scope)
     try:
-        known = await credentials.resolve_stopper(found, client_key(scope))
+        stopper = await credentials.resolve_stopper(candidates, client_key(scope))
     except Unverifiable as fault:
         raise Refused(stops.UNKNOWN_STOPPER(why=fault), 503) from None
-    if known is None:
-        raise _unknown_credentials(found, scope)
-    return known
+    if stopper is None:
+        raise _unknown_credentials(candidates, scope)
+    return stopper
 
 
-def _unknown_credentials(found: list[Credential], scope: dict[str, Any]) -> Refused:
-    if all(kind != TOKEN for kind, _ in found):
+def _unknown_credentials(candidates: list[Credential], scope: dict[str, Any]) -> Refused:
+    if all(kind != TOKEN for kind, _ in candidates):
         return Refused(NOT_LOGGED_IN, 401)
     login_audit.log_token_refused(client_address(ASGIRequest(scope, BytesIO())), UNKNOWN)
     return Refused(_UNKNOWN_TOKEN(unknown=UNKNOWN), 401)
@@ -280,14 +280,14 @@ def _credentials(scope: dict[str, Any]) -> list[Credential]:
     """Return (kind, secret) of all credentials, tokens first; a proxy's header or a foreign cookie must not
     hide a session.
     """
-    found = []
+    candidates = []
     for header in _headers(scope, b"authorization")[:_MOST_TOKENS]:
         scheme, _, secret = header.strip().partition(" ")
-        found.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
-    found += [(SESSION, key) for key in session_keys(_headers(scope, b"cookie"))]
-    if not found:
+        candidates.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
+    candidates += [(SESSION, key) for key in session_keys(_headers(scope, b"cookie"))]
+    if not candidates:
         raise Refused(NOT_LOGGED_IN, 401)
-    return found
+    return candidates
 
 
 def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
@@ -306,10 +306,10 @@ def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
 
 def _parse_body(body: bytes) -> dict[str, Any]:
     try:
-        said = json.loads(body)
+        fields = json.loads(body)
     except (ValueError, RecursionError):
         return {}
-    return said if isinstance(said, dict) else {}
+    return fields if isinstance(fields, dict) else {}
 
 
 async def _body(receive: _Receive) -> bytes | None:
@@ -342,12 +342,12 @@ def _is_known(host: str) -> bool:
     return validate_host(split_domain_port(host)[0], settings.ALLOWED_HOSTS)
 
 
-def _header(scope: dict[str, Any], wanted: bytes) -> str:
-    return next(iter(_headers(scope, wanted)), "")
+def _header(scope: dict[str, Any], key: bytes) -> str:
+    return next(iter(_headers(scope, key)), "")
 
 
-def _headers(scope: dict[str, Any], wanted: bytes) -> list[str]:
-    return [value.decode("latin-1") for name, value in scope["headers"] if name == wanted]
+def _headers(scope: dict[str, Any], key: bytes) -> list[str]:
+    return [value.decode("latin-1") for name, value in scope["headers"] if name == key]
 
 
 async def _send(send: Any, status: int, answer: Mapping[str, Any], more: _Headers = ()) -> None:

@@ -75,11 +75,11 @@ def user_of_token(*, secret: str, ended: bool = False) -> User | None:
     """
     if not ended and (len(secret) != _LENGTH or not secret.startswith(PREFIX)):
         return None  # no database query for other formats
-    found = Token.objects.select_related("user").filter(digest=digest(secret), user__is_active=True).first()
-    if found is None or (found.ends_at <= timezone.now() and not ended):
+    token = Token.objects.select_related("user").filter(digest=digest(secret), user__is_active=True).first()
+    if token is None or (token.ends_at <= timezone.now() and not ended):
         return None
-    _note_use(found)
-    user: User = found.user
+    _note_use(token)
+    user: User = token.user
     return user
 
 

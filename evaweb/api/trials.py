@@ -138,8 +138,12 @@ class TrialDetail(_Detail):
     def of(trial: Trial, sight: Visibility) -> dict[str, Any]:
         """Return the trial with all details."""
         scores = [ScoreOut.of(score) for score in trial.scores.all()]
-        asked = [VoidRequestOut.of(row) for row in trial.void_requests.all()]
-        return {**visible_columns(trial, sight, (*_LIST, *_DETAIL)), "scores": scores, "void_requests": asked}
+        requests = [VoidRequestOut.of(row) for row in trial.void_requests.all()]
+        return {
+            **visible_columns(trial, sight, (*_LIST, *_DETAIL)),
+            "scores": scores,
+            "void_requests": requests,
+        }
 
 
 class ScoreIn(Body):
@@ -201,11 +205,11 @@ def trials(
     request: HttpRequest, filters: Query[Filters], paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Return the trials, newest first, in pages; with `format=csv` or `parquet` all that match, oldest first."""
-    seen = visibility_for_request(request)
+    visibility = visibility_for_request(request)
     if format != "json":
-        pages = selectors.trials_in_pages(filters.chosen(), sight=seen)
-        return table_response(request, "trials", COLUMNS, _csv_pages(pages, seen), format)
-    return paging.page(selectors.trial_list(filters.chosen(), seen), TrialOut, seen)
+        pages = selectors.trials_in_pages(filters.chosen(), sight=visibility)
+        return table_response(request, "trials", COLUMNS, _csv_pages(pages, visibility), format)
+    return paging.page(selectors.trial_list(filters.chosen(), visibility), TrialOut, visibility)
 
 
 @router.get("/{int:id}", response={200: TrialDetail, **FAILURES}, summary="One trial", url_name="trial")
@@ -217,8 +221,8 @@ def trial(request: HttpRequest, id: int) -> Any:
 @router.post("/{int:id}/score", response={200: TrialDetail, **FAILURES}, summary="Score it", url_name="score")
 def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
     """Add a score, or a correction. Requires an operator."""
-    found = selectors.trial_get(id=id)
-    services.score_trial(user=request.auth, trial=found, **given.model_dump())
+    trial = selectors.trial_get(id=id)
+    services.score_trial(user=request.auth, trial=trial, **given.model_dump())
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
@@ -233,8 +237,8 @@ def failure(request: HttpRequest, id: int, given: FailureIn) -> Any:
 
     Requires an operator.
     """
-    found = selectors.trial_get(id=id)
-    corrections.trial_failure(user=request.auth, trial=found, **given.model_dump())
+    trial = selectors.trial_get(id=id)
+    corrections.trial_failure(user=request.auth, trial=trial, **given.model_dump())
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
@@ -271,15 +275,15 @@ def abandon(request: HttpRequest, id: int, given: Reason) -> Any:
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
-def _csv_pages(pages: Iterator[list[Trial]], sight: Visibility) -> Iterator[list[dict[str, Any]]]:
+def _csv_pages(pages: Iterator[list[Trial]], visibility: Visibility) -> Iterator[list[dict[str, Any]]]:
     for page in pages:
-        yield [_csv_row(trial, sight) for trial in page]
+        yield [_csv_row(trial, visibility) for trial in page]
 
 
-def _csv_row(trial: Trial, sight: Visibility) -> dict[str, Any]:
+def _csv_row(trial: Trial, visibility: Visibility) -> dict[str, Any]:
     outcomes = list(trial.verdict.outcomes.all()) if trial.verdict else []
     return {
-        **TrialOut.of(trial, sight),
+        **TrialOut.of(trial, visibility),
         "milestones_reached": "; ".join(outcome.text for outcome in outcomes if outcome.reached),
         "milestones_missed": "; ".join(outcome.text for outcome in outcomes if not outcome.reached),
     }

@@ -131,9 +131,9 @@ def uncovered(text: str) -> str | None:
     if text.id in _LIMITS:
         return _LIMITS[text.id]
     if text.id in _IN_A_ROW:
-        why = text.arguments.get("why")
-        said = uncovered(why) if isinstance(why, str) else None
-        return _SAFE if said is None else _REFUSED(why=said)
+        reason = text.arguments.get("why")
+        plain_reason = uncovered(reason) if isinstance(reason, str) else None
+        return _SAFE if plain_reason is None else _REFUSED(why=plain_reason)
     kind = text.id.partition(".")[0]
     if kind in _OF_THE_ROBOT:
         return None if text.id in _NOT else _whole(text)
@@ -154,14 +154,14 @@ def _whole(text: Sentence) -> str | None:
 
 def _with_parts(text: Sentence) -> str | None:
     """Return the message with its nested messages redacted; None if one is hidden or contains foreign text."""
-    said, whole = plain(text), True
+    message, whole = plain(text), True
     for name, of in text.arguments.items():
         if isinstance(of, Sentence):
-            shown = uncovered(of)
-            if shown is None or plain(of) not in said:
+            visible = uncovered(of)
+            if visible is None or plain(of) not in message:
                 return None
-            if shown != of:
-                said, whole = said.replace(plain(of), plain(shown)), False
+            if visible != of:
+                message, whole = message.replace(plain(of), plain(visible)), False
         elif isinstance(of, str) and of and name not in _NAMES and text.id != _BY_A_PERSON:
             return None
-    return text if whole else said
+    return text if whole else message

@@ -62,8 +62,10 @@ def is_recording_hidden(context: Any, episode: Any) -> bool:
 @register.simple_tag(takes_context=True)
 def end_reason(context: Any, episode: Any) -> str:
     """Return the reason why a recording ended, redacted if its policy is hidden."""
-    seen = visibility_for_request(context["request"])
-    return seen.redact_text(episode.reason) if seen.hides_episode(episode) else str(episode.reason)
+    visibility = visibility_for_request(context["request"])
+    return (
+        visibility.redact_text(episode.reason) if visibility.hides_episode(episode) else str(episode.reason)
+    )
 
 
 @register.filter

@@ -101,11 +101,11 @@ class Visibility:
 
         `covered` replaces a message that must be hidden entirely.
         """
-        shown = text
+        redacted = text
         if text and not _HARMLESS.fullmatch(text):
-            said = uncovered(text)
-            shown = covered if said is None else said
-        return shown if shows(shown, identity(shown)["arguments"]) else plain(shown)
+            message = uncovered(text)
+            redacted = covered if message is None else message
+        return redacted if shows(redacted, identity(redacted)["arguments"]) else plain(redacted)
 
     def filter_visible(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
         """Exclude rows of hidden checkpoints; `checkpoint` is the query path to the checkpoint."""
@@ -191,8 +191,8 @@ def visibility_for_request(request: Any) -> Visibility:
     """Return the Visibility of the user of a login or token; looked up once per request."""
     if not hasattr(request, "_eva_sight"):
         request._eva_sight = visibility_for_user(getattr(request, "auth", None) or request.user)
-    found: Visibility = request._eva_sight
-    return found
+    visibility: Visibility = request._eva_sight
+    return visibility
 
 
 def code_of(trial: Any) -> str:

@@ -14,12 +14,12 @@ SHOWN = 8  # listed jobs; the remaining ones are counted
 def session_panel(*, station: Station) -> dict[str, Any]:
     """Return the open session with its counts, else the data for opening or resuming one."""
     session = selectors.session_open(station=station)
-    shown: dict[str, Any] = {"station": station, "session": session}
+    context: dict[str, Any] = {"station": station, "session": session}
     if session is not None:
-        return {**shown, "counts": selectors.session_counts(session=session)}
+        return {**context, "counts": selectors.session_counts(session=session)}
     earlier = list(selectors.resumable_sessions(station=station))
     return {
-        **shown,
+        **context,
         "earlier": earlier,
         "tasks": selectors.earlier_tasks(station=station),
         "dataset": earlier[0].dataset if earlier else "",
@@ -29,12 +29,12 @@ def session_panel(*, station: Station) -> dict[str, Any]:
 def progress_panel(*, station: Station) -> dict[str, Any]:
     """Return for the open session its last episode, the job queue, and what can be published."""
     session = selectors.session_open(station=station)
-    shown: dict[str, Any] = {"station": station, "session": session}
+    context: dict[str, Any] = {"station": station, "session": session}
     if session is None:
-        return shown
+        return context
     queue = session_queue(session=session)
     return {
-        **shown,
+        **context,
         "counts": selectors.session_counts(session=session),
         "last": selectors.demonstrations_of(session=session).first(),
         "queue": queue,

@@ -45,22 +45,22 @@ def restore(kept: RestorableRun) -> int:
     except ValueError:
         raise EvaError(_SESSION_NO_UUID(named=named)) from None
     with transaction.atomic():
-        session, made = CollectSession.objects.filter(pk=uuid).first(), 0
+        session, created = CollectSession.objects.filter(pk=uuid).first(), 0
         if session is None:
-            session, made = _session(uuid, episode, kept), 1
+            session, created = _session(uuid, episode, kept), 1
         fresh = not Demonstration.objects.filter(pk=episode.pk).exists()
         demonstration = bind_demonstration(episode=episode, session=session)
         assert demonstration is not None
         sync_label(demonstration=demonstration)
-    return made + fresh
+    return created + fresh
 
 
-def _session(uuid: UUID, episode: Episode, kept: RestorableRun) -> CollectSession:
+def _session(uuid: UUID, episode: Episode, run: RestorableRun) -> CollectSession:
     """Restore a session from its file, else from the manifest of its first episode found.
 
     A manifest has neither target nor history.
     """
-    events = SESSIONS.read(uuid, kept.report_problem)
+    events = SESSIONS.read(uuid, run.report_problem)
     first = next((event for event in events if event.kind == "opened"), None)
     if first is None:
         return _from_manifest(uuid, episode)

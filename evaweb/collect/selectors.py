@@ -57,26 +57,26 @@ class Dataset:
         """Versions that can be requested, the default first."""
         if self.version:
             return (self.version,)
-        others = (version for version in WRITABLE_VERSIONS if version != DEFAULT_VERSION)
-        return (DEFAULT_VERSION, *others)
+        other_versions = (version for version in WRITABLE_VERSIONS if version != DEFAULT_VERSION)
+        return (DEFAULT_VERSION, *other_versions)
 
 
 def session_list(
     *, station: str = "", dataset: str = "", is_open: bool | None = None
 ) -> QuerySet[CollectSession]:
     """Return the sessions, newest first."""
-    found = CollectSession.objects.select_related("station", "operator").order_by("-opened_at", "pk")
-    wanted = {"station__name": station, "dataset": dataset}
-    found = found.filter(**{name: value for name, value in wanted.items() if value})
-    return found if is_open is None else found.filter(closed_at__isnull=is_open)
+    rows = CollectSession.objects.select_related("station", "operator").order_by("-opened_at", "pk")
+    lookups = {"station__name": station, "dataset": dataset}
+    rows = rows.filter(**{name: value for name, value in lookups.items() if value})
+    return rows if is_open is None else rows.filter(closed_at__isnull=is_open)
 
 
 def session_get(*, uuid: UUID) -> CollectSession:
     """Return the session. Raises: NotFound."""
-    found = session_list().filter(pk=uuid).first()
-    if found is None:
+    session = session_list().filter(pk=uuid).first()
+    if session is None:
         raise NotFound(_SESSION_DOES_NOT_EXIST_THIS(uuid=uuid))
-    return found
+    return session
 
 
 def session_open(*, station: Station) -> CollectSession | None:
@@ -101,7 +101,7 @@ def earlier_tasks(*, station: Station) -> list[str]:
 def session_counts(*, session: CollectSession) -> Counts:
     """Return the numbers of the session's episodes."""
     cut = Q(discarded=False, episode__status__in=(EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED))
-    wanted = {
+    conditions = {
         "saved": _saved(),
         **{result.value or "unlabelled": _saved() & Q(result=result) for result in Result},
         "discarded": Q(discarded=True),
@@ -110,9 +110,9 @@ def session_counts(*, session: CollectSession) -> Counts:
     }
     # Prefixed names: an aggregate with a field's name would shadow the field in later ones.
     counted = session.demonstrations.aggregate(
-        **{f"n_{name}": Count("pk", of) for name, of in wanted.items()}
+        **{f"n_{name}": Count("pk", of) for name, of in conditions.items()}
     )
-    return Counts(**{name: counted[f"n_{name}"] for name in wanted})
+    return Counts(**{name: counted[f"n_{name}"] for name in conditions})
 
 
 def _saved(path: str = "") -> Q:

@@ -124,13 +124,13 @@ def close_session(*, user: Any, session: CollectSession) -> CollectSession:
     if running and session.demonstrations.filter(pk=running).exists():
         raise Conflict(_EPISODE_BEING_RECORDED_STOP_FIRST)
     with transaction.atomic():
-        held = _lock_session(session)
-        if held.closed_at is not None:
-            raise Conflict(_SESSION_CLOSED_ALREADY(session=held.pk))
-        held.closed_at = timezone.now()
-        _record_event(held, user, SessionEventKind.CLOSED)
-        held.save(update_fields=["closed_at"])
-    return held
+        locked = _lock_session(session)
+        if locked.closed_at is not None:
+            raise Conflict(_SESSION_CLOSED_ALREADY(session=locked.pk))
+        locked.closed_at = timezone.now()
+        _record_event(locked, user, SessionEventKind.CLOSED)
+        locked.save(update_fields=["closed_at"])
+    return locked
 
 
 def resume_session(*, user: Any, session: CollectSession) -> CollectSession:
@@ -145,13 +145,13 @@ def resume_session(*, user: Any, session: CollectSession) -> CollectSession:
     _require_none_open(station)
     try:
         with transaction.atomic():
-            held = _lock_session(session)
-            held.closed_at = None
-            held.save(update_fields=["closed_at"])
-            _record_event(held, user, SessionEventKind.RESUMED)
+            locked = _lock_session(session)
+            locked.closed_at = None
+            locked.save(update_fields=["closed_at"])
+            _record_event(locked, user, SessionEventKind.RESUMED)
     except IntegrityError:
         raise Conflict(_SOMEONE_ELSE_OPENED_SESSION_AT(name=station.name)) from None
-    return held
+    return locked
 
 
 @transaction.atomic
@@ -159,11 +159,11 @@ def set_session_target(*, user: Any, session: CollectSession, target: int | None
     """Set the desired number of episodes, None for no target."""
     require_role(user, Role.OPERATOR)
     _check_target(target)
-    held = _lock_session(session)
-    held.target = target
-    _record_event(held, user, SessionEventKind.TARGET, f"{target or 'none'}")
-    held.save(update_fields=["target"])
-    return held
+    locked = _lock_session(session)
+    locked.target = target
+    _record_event(locked, user, SessionEventKind.TARGET, f"{target or 'none'}")
+    locked.save(update_fields=["target"])
+    return locked
 
 
 def publish_session(
@@ -188,8 +188,8 @@ def publish_session(
     if dataset.problem:
         raise Conflict(dataset.problem)
     if version and version not in dataset.versions:
-        why = f": {dataset.name} is of that version already, convert it" if dataset.version else ""
-        raise Conflict(_VERSION_ALLOWED(version=version, versions=", ".join(dataset.versions), why=why))
+        suffix = f": {dataset.name} is of that version already, convert it" if dataset.version else ""
+        raise Conflict(_VERSION_ALLOWED(version=version, versions=", ".join(dataset.versions), why=suffix))
     waiting = list(selectors.unpublished_demonstrations(session=session, results=tuple(results)))
     if not waiting:
         raise Conflict(_NOTHING_PUBLISH_EPISODES_WHOLE_NOT(results=" or ".join(results)))
@@ -201,13 +201,13 @@ def publish_session(
             SessionEventKind.PUBLISHED,
             f"{len(waiting)} episodes into {dataset.name}",
         )
-        asked = [request_publish(episode=one.episode, version=chosen) for one in waiting]
-    return [job for job in asked if job is not None]
+        jobs = [request_publish(episode=demonstration.episode, version=chosen) for demonstration in waiting]
+    return [job for job in jobs if job is not None]
 
 
-def _record_event(session: CollectSession, user: Any, kind: SessionEventKind, words: str = "") -> None:
+def _record_event(session: CollectSession, user: Any, kind: SessionEventKind, text: str = "") -> None:
     """Write an event to disk and database; the caller holds a lock on the session's row."""
-    event = SessionEvent(session=session, kind=kind, text=words, by=user, at=timezone.now())
+    event = SessionEvent(session=session, kind=kind, text=text, by=user, at=timezone.now())
     SESSIONS.append(session.pk, EventLine.written(event))
     event.save(force_insert=True)
 
@@ -218,9 +218,9 @@ def _lock_session(session: CollectSession) -> CollectSession:
 
 
 def _require_none_open(station: Station) -> None:
-    other = selectors.session_open(station=station)
-    if other is not None:
-        raise Conflict(_SESSION_OPEN_AT_CLOSE_FIRST(name=station.name, other=other))
+    open_one = selectors.session_open(station=station)
+    if open_one is not None:
+        raise Conflict(_SESSION_OPEN_AT_CLOSE_FIRST(name=station.name, other=open_one))
 
 
 def _commanded_snapshot(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:

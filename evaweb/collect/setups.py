@@ -66,26 +66,27 @@ def setup_differences(given: Setup, allowed: Setup) -> list[str]:
 
 def require_same_setup(given: Setup, allowed: Setup, whose: str) -> None:
     """Raise SetupChanged with every difference; `whose` names the owner of `allowed`."""
-    found = setup_differences(given, allowed)
-    if found:
-        raise SetupChanged(_SET_UP_DIFFERS_FROM(whose=whose, found="; ".join(found)))
+    differences = setup_differences(given, allowed)
+    if differences:
+        raise SetupChanged(_SET_UP_DIFFERS_FROM(whose=whose, found="; ".join(differences)))
 
 
-def _plain(given: Setup, allowed: Setup) -> Iterator[str]:
+def _plain(setup: Setup, allowed: Setup) -> Iterator[str]:
     for name in _PLAIN:
-        if given[name] != allowed[name]:
-            yield f"{name} = {_words(given[name])}, allowed {_words(allowed[name])}"
+        if setup[name] != allowed[name]:
+            yield f"{name} = {_words(setup[name])}, allowed {_words(allowed[name])}"
 
 
-def _cameras(given: Mapping[str, Any], allowed: Mapping[str, Any]) -> Iterator[str]:
-    for key in sorted(given.keys() | allowed.keys()):
-        if given.get(key) != allowed.get(key):
-            yield f"camera {key} = {_size(given.get(key))}, allowed {_size(allowed.get(key))}"
+def _cameras(sizes: Mapping[str, Any], allowed: Mapping[str, Any]) -> Iterator[str]:
+    for key in sorted(sizes.keys() | allowed.keys()):
+        if sizes.get(key) != allowed.get(key):
+            yield f"camera {key} = {_size(sizes.get(key))}, allowed {_size(allowed.get(key))}"
 
 
-def _streams(given: Setup, allowed: Setup) -> Iterator[str]:
+def _streams(own: Setup, allowed: Setup) -> Iterator[str]:
     recorded = [
-        sorted(name for name, there in setup["streams"].items() if there) for setup in (given, allowed)
+        sorted(name for name, is_recorded in setup["streams"].items() if is_recorded)
+        for setup in (own, allowed)
     ]
     if recorded[0] != recorded[1]:
         yield f"recorded = {_words(recorded[0])}, allowed {_words(recorded[1])}"

@@ -51,14 +51,14 @@ def session_command(
     require_role(user, Role.OPERATOR)
     identity = parse_command_uuid(uuid)
     own = _own(session, kind, user)
-    beside = dict(args or {})
-    doubled = sorted(own.keys() & beside.keys())
+    further = dict(args or {})
+    doubled = sorted(own.keys() & further.keys())
     if doubled:
         raise EvaError(_ARGS_SAY_BESIDE_SESSION_WHICH(doubled=", ".join(doubled)))
     if not Command.objects.filter(pk=identity).exists():  # a repeated uuid only asks for the outcome
         _require_fit(session, kind)
     row = issue_command(
-        user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given
+        user=user, station=session.station, kind=kind, args={**further, **own}, uuid=identity, **given
     )
     if kind == "run" and row.status in CARRIED_OUT and row.data.get("episode"):
         _begun(session, row, user.get_username())

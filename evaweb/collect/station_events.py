@@ -30,16 +30,16 @@ def apply_station_event(*, event: Mapping[str, Any]) -> Demonstration | None:
         uuid = UUID(str(data.get("episode") or data.get("uuid")))
     except ValueError:
         return None
-    found = get_or_create_demonstration(episode=Episode.objects.filter(pk=uuid).first())
-    return None if found is None else sync_label(demonstration=found)
+    demonstration = get_or_create_demonstration(episode=Episode.objects.filter(pk=uuid).first())
+    return None if demonstration is None else sync_label(demonstration=demonstration)
 
 
 def get_or_create_demonstration(*, episode: Episode | None) -> Demonstration | None:
     """Return the demonstration of an episode; create it if the manifest names a known session."""
     if episode is None:
         return None
-    found = Demonstration.objects.filter(pk=episode.pk).first()
-    return found or bind_demonstration(episode=episode, session=_session_of(episode))
+    demonstration = Demonstration.objects.filter(pk=episode.pk).first()
+    return demonstration or bind_demonstration(episode=episode, session=_session_of(episode))
 
 
 def bind_demonstration(*, episode: Episode, session: CollectSession | None) -> Demonstration | None:
@@ -61,18 +61,18 @@ def _session_of(episode: Episode) -> CollectSession | None:
 @transaction.atomic
 def sync_label(*, demonstration: Demonstration) -> Demonstration:
     """Update the row from the newest label on disk; republish a published episode if its result changed."""
-    held = (
+    locked = (
         Demonstration.objects.select_for_update(of=("self",))
         .select_related("episode")
         .get(pk=demonstration.pk)
     )
-    label = latest_label(data_dir(), str(held.pk))
+    label = latest_label(data_dir(), str(locked.pk))
     if label is None:
-        return held
-    before = held.result
-    held.result, held.note, held.discarded = label.result or "", label.note, label.discarded
-    held.labelled_by, held.labelled_at = label.by[:150], datetime.fromtimestamp(label.time, UTC)
-    held.save()
-    if before != held.result and held.episode.dataset_index is not None and not held.discarded:
-        request_publish(episode=held.episode)
-    return held
+        return locked
+    before = locked.result
+    locked.result, locked.note, locked.discarded = label.result or "", label.note, label.discarded
+    locked.labelled_by, locked.labelled_at = label.by[:150], datetime.fromtimestamp(label.time, UTC)
+    locked.save()
+    if before != locked.result and locked.episode.dataset_index is not None and not locked.discarded:
+        request_publish(episode=locked.episode)
+    return locked

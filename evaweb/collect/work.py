@@ -75,16 +75,18 @@ def session_queue(*, session: CollectSession) -> Queue:
     having = served()
     items = sorted((_item(job, frames, speeds, having) for job in open_jobs), key=_queue_order)
     waiting = [item.left_s for item in items if item.job.status != JobStatus.FAILED]
-    known = [left for left in waiting if left is not None]
-    return Queue(tuple(items), len(newest) - len(items), sum(known) if len(known) == len(waiting) else None)
+    estimates = [left for left in waiting if left is not None]
+    return Queue(
+        tuple(items), len(newest) - len(items), sum(estimates) if len(estimates) == len(waiting) else None
+    )
 
 
 def _newest(keys: Sequence[str]) -> list[Job]:
-    found: dict[str, Job] = {}
+    by_key: dict[str, Job] = {}
     for part in _parts(keys):
         for job in Job.objects.filter(key__in=part).order_by("created_at", "pk"):
-            found[job.key] = job
-    return list(found.values())
+            by_key[job.key] = job
+    return list(by_key.values())
 
 
 def _parts(keys: Sequence[str]) -> Iterator[list[str]]:
@@ -114,10 +116,12 @@ def _queue_order(item: QueueItem) -> tuple[int, object]:
 
 def _seconds_per_frame(kind: str) -> float | None:
     """Return the average of the last finished jobs of that kind [s]; None if there are none."""
-    done = Job.objects.filter(
+    completed = Job.objects.filter(
         kind=kind, status=JobStatus.DONE, claimed_at__isnull=False, finished_at__isnull=False
     )
-    rows = list(done.order_by("-finished_at").values_list("key", "claimed_at", "finished_at")[:_MEASURED])
+    rows = list(
+        completed.order_by("-finished_at").values_list("key", "claimed_at", "finished_at")[:_MEASURED]
+    )
     uuids = [key.partition(":")[2] for key, _, _ in rows]
     frames = sum(Episode.objects.filter(pk__in=uuids).values_list("frames", flat=True))
     seconds = sum((finished - claimed).total_seconds() for _, claimed, finished in rows)

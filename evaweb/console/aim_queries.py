@@ -69,15 +69,15 @@ class AimQueries:
             while (request := self._waiting) is not None:
                 self._waiting = None
                 work = partial(query_aim, self._station.name, self._username, request.args, self._looks())
-                found = await self._query(work, request.id)
-                self._say({"type": "aimed", "id": request.id, **found})
+                result = await self._query(work, request.id)
+                self._say({"type": "aimed", "id": request.id, **result})
         finally:
             self._under_way = False
 
     async def _query(self, work: Callable[[], dict[str, Any]], identity: int) -> dict[str, Any]:
         try:
-            asked = _under_way.submit(self._station.name, work, key=id(self), identity=identity)
-            return await asyncio.wrap_future(asked)
+            answer = _under_way.submit(self._station.name, work, key=id(self), identity=identity)
+            return await asyncio.wrap_future(answer)
         except TooManyRequests as fault:
             return _refused(str(fault))
 
@@ -87,8 +87,8 @@ def _refused(reason: str) -> dict[str, Any]:
 
     Its `sentence` holds the reason's pattern id and arguments, because the answer's own "id" is that of the query.
     """
-    known = {"sentence": identity(reason)} if isinstance(reason, Sentence) else {}
-    return {"ok": False, "reason": reason, **known}
+    fields = {"sentence": identity(reason)} if isinstance(reason, Sentence) else {}
+    return {"ok": False, "reason": reason, **fields}
 
 
 def query_aim(
@@ -105,20 +105,20 @@ def query_aim(
         return _refused(str(gone))
     data = to_json_value(dict(ack.data))
     links = _links(looks, data.get("joints")) if ack.status == "done" else []
-    said = {**_refused(with_display_names(ack.reason)), "ok": ack.status == "done"}
-    return {**data, **said, "links": links}
+    outcome = {**_refused(with_display_names(ack.reason)), "ok": ack.status == "done"}
+    return {**data, **outcome, "links": links}
 
 
-def _links(looks: DrawnRobot | None, joints: Any) -> list[float]:
+def _links(drawn: DrawnRobot | None, joints: Any) -> list[float]:
     """Return the pose of every link at `joints` in the world frame, each matrix in column-major order.
 
     [] if the robot is not drawn.
     """
     target = np.asarray(joints, np.float64)
-    if looks is None or target.shape != (looks.robot.dim,):
+    if drawn is None or target.shape != (drawn.robot.dim,):
         return []
-    found: list[float] = looks.poses(target).astype(np.float64).round(_DIGITS).ravel().tolist()
-    return found if np.isfinite(found).all() else []
+    poses: list[float] = drawn.poses(target).astype(np.float64).round(_DIGITS).ravel().tolist()
+    return poses if np.isfinite(poses).all() else []
 
 
 @cache

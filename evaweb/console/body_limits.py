@@ -132,9 +132,9 @@ class BoundedRequest(WebRequest):
 
     def basic_error(self, status: int, status_text: bytes, body: str) -> None:
         """Send Daphne's own answers, to invalid headers and addresses and after faults, in our format."""
-        headers, said = refusal(status, body, self.path or b"")
+        headers, content = refusal(status, body, self.path or b"")
         self.handle_reply({"type": "http.response.start", "status": status, "headers": headers})
-        self.handle_reply({"type": "http.response.body", "body": said})
+        self.handle_reply({"type": "http.response.body", "body": content})
 
     def connectionLost(self, reason: object) -> None:
         """Handle a lost connection; an e-stop whose headers are complete is still processed."""
@@ -172,12 +172,12 @@ class BoundedRequest(WebRequest):
         deferToThread(_role, keys).addCallback(self._known).addErrback(self._unknown)
 
     def _known(self, role: Role | None) -> None:
-        said = (
+        sentence = (
             "log in first"
             if role is None
             else f"you are {role.with_article}; this needs {Role.ADMIN.with_article}"
         )
-        self._go_on(0 if role is Role.ADMIN else 403, said)
+        self._go_on(0 if role is Role.ADMIN else 403, sentence)
 
     def _unknown(self, failure: Any) -> None:
         log.error("the database does not say who sends %s: %s", self._path, failure.value)

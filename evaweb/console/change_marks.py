@@ -39,19 +39,19 @@ def changed_names(before: ChangeMarks, now: ChangeMarks) -> list[str]:
 
 def change_marks(station: str) -> ChangeMarks:
     """Return one mark per topic that differs after every change of its rows."""
-    here = Q(station__name=station)
+    of_station = Q(station__name=station)
     return {
         "lease": (
-            Lease.objects.filter(here).aggregate(
+            Lease.objects.filter(of_station).aggregate(
                 Max("id"), Max("ended_at"), open=Count("id", Q(ended_at=None))
             ),
-            LeaseRequest.objects.filter(here).aggregate(Max("id"), Max("answered_at")),
+            LeaseRequest.objects.filter(of_station).aggregate(Max("id"), Max("answered_at")),
         ),
         "trial": (
-            Trial.objects.filter(here).aggregate(Max("id"), Max("changed_at")),
+            Trial.objects.filter(of_station).aggregate(Max("id"), Max("changed_at")),
             Score.objects.filter(trial__station__name=station).aggregate(Max("id")),
         ),
-        "episode": Episode.objects.filter(here).aggregate(
+        "episode": Episode.objects.filter(of_station).aggregate(
             Max("created_at"),
             Max("previewed_at"),
             Max("published_at"),

@@ -15,10 +15,10 @@ def check_third_party_scripts(**options: Any) -> list[CheckMessage]:
     """Return a warning for each third-party script that is not found among the static files."""
     return [
         Warning(
-            f"{script} is absent: pages are shown without {what}",
+            f"{script} is absent: pages are shown without {feature}",
             hint="make setup brings it",
             id=f"console.W{number:03}",
         )
-        for number, (script, what) in enumerate(_WANTED.items(), 1)
+        for number, (script, feature) in enumerate(_WANTED.items(), 1)
         if finders.find(script) is None
     ]

@@ -62,13 +62,13 @@ class ConnectionLimiter:
 
     def remove(self, key: int) -> None:
         """Remove a connection that has sent a request or was closed."""
-        found = self._all.pop(key, None)
-        if found is None:
+        connection = self._all.pop(key, None)
+        if connection is None:
             return
-        of_one = self._of[found.peer]
+        of_one = self._of[connection.peer]
         del of_one[key]
         if not of_one:
-            del self._of[found.peer]
+            del self._of[connection.peer]
 
     def close_expired(self) -> None:
         """Close the connections whose time is up."""
@@ -150,6 +150,6 @@ class LimitedFactory(WrappingFactory):
         self.turns = TurnScheduler(partial(events.callLater, 0))
 
     def buildProtocol(self, addr: IAddress) -> ProtocolWrapper:
-        made = super().buildProtocol(addr)
-        made.wrappedProtocol.requestFactory = self._request
-        return made
+        protocol = super().buildProtocol(addr)
+        protocol.wrappedProtocol.requestFactory = self._request
+        return protocol

@@ -113,8 +113,8 @@ class StationConsumer(AsyncWebsocketConsumer):
         It is accepted first because browsers report only codes that are sent after accepting.
         """
         await self.accept()
-        said = (value.decode("latin-1") for name, value in self.scope["headers"] if name == b"cookie")
-        self._sessions = session_keys(said)
+        cookies = (value.decode("latin-1") for name, value in self.scope["headers"] if name == b"cookie")
+        self._sessions = session_keys(cookies)
         self._page = parse_qs(self.scope["query_string"].decode()).get("page", [""])[-1]
         self._station = self.scope["url_route"]["kwargs"]["name"]
         if not self._sessions:
@@ -122,11 +122,11 @@ class StationConsumer(AsyncWebsocketConsumer):
         elif not requests.PAGE.fullmatch(self._page):
             await self.close(BAD_REQUEST, "page = 1 to 64 letters, digits, - or _")
         else:
-            known = (key for key in self._sessions if credentials.recall(SESSION, key))
-            self._session = next(known, self._sessions[0])
-            found = [(SESSION, key) for key in self._sessions]
+            recalled = (key for key in self._sessions if credentials.recall(SESSION, key))
+            self._session = next(recalled, self._sessions[0])
+            candidates = [(SESSION, key) for key in self._sessions]
             self._stopping = PageStops(
-                self._station, self._page, found, client_key(self.scope), self._send_text, _go_on
+                self._station, self._page, candidates, client_key(self.scope), self._send_text, _go_on
             )
             self._run_until_closed(self._write())
             self._run_until_closed(self._admit())
@@ -143,7 +143,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             except Error as error:
                 log.warning("the database does not say who has opened a page of %s: %s", self._station, error)
                 await asyncio.sleep(_AGAIN_S)
-        self._session, user, station, role, facts, sight = admitted
+        self._session, user, station, role, facts, visibility = admitted
         if not self._session:
             await self._end(NO_LOGIN, "log in first")
             return
@@ -152,7 +152,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._send_text({"type": "hello", **hello, "facts": facts})
         room = self._room = hub().room(station.name, station.robot)
         self._aims = AimQueries(station, user.get_username(), role, self._send_text, lambda: room.drawn_robot)
-        self._mailbox = room.join(self._outbox.put_nowait, user, sight)
+        self._mailbox = room.join(self._outbox.put_nowait, user, visibility)
         self._run_until_closed(self._follow_login(role))
         self._admitted = True
         early, self._early = self._early, []
@@ -243,8 +243,8 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._mailbox.want_events(request.after, request.boot)
             self._room.schedule_flush()
         elif isinstance(request, Aim) and self._counted is None:
-            said = {"ok": False, "reason": _NOT_SAID, "sentence": identity(_NOT_SAID)}
-            self._send_text({"type": "aimed", "id": request.id, **said})
+            refusal = {"ok": False, "reason": _NOT_SAID, "sentence": identity(_NOT_SAID)}
+            self._send_text({"type": "aimed", "id": request.id, **refusal})
         elif isinstance(request, Aim) and self._aims.submit(request):
             _go_on(self._aims.answer())
 

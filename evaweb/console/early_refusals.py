@@ -36,22 +36,22 @@ def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
     else:
         kind, policy = "text/html; charset=utf-8", {b"content-security-policy": PLAIN_PAGE.encode()}
         body = render_to_string("unavailable.html", {"sentence": sentence, "status": status})
-    said = body.encode()
+    content = body.encode()
     described = {
         b"content-type": kind.encode(),
-        b"content-length": b"%d" % len(said),
+        b"content-length": b"%d" % len(content),
         **dict(DEFAULT_HEADERS),
         **policy,
     }
-    return list(described.items()), said
+    return list(described.items()), content
 
 
 def raw_refusal(status: int, sentence: str, path: bytes) -> bytes:
     """Return the refusal as bytes of an HTTP response that closes its connection."""
-    headers, said = refusal(status, sentence, path)
+    headers, content = refusal(status, sentence, path)
     lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode()]
     lines += [name.title() + b": " + value for name, value in headers]
-    return b"\r\n".join([*lines, b"Connection: close", b"", said])
+    return b"\r\n".join([*lines, b"Connection: close", b"", content])
 
 
 class Channel(HTTPChannel):  # type: ignore[misc]

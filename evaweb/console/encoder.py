@@ -28,21 +28,21 @@ def encode_chunk(content: Mapping[str, Any], looks: DrawnRobot | None, now: floa
     the rows drawn as robots. Arrays: `tips` float32 [H, arms, 3], fingertip positions of each row [m, world]; `ghost`
     float32 [N, P, 16], only of a proposed chunk. Both are omitted if the robot is not drawn.
     """
-    words: dict[str, Any] = {key: content[key] for key in _WORDS if key in content}
+    facts: dict[str, Any] = {key: content[key] for key in _WORDS if key in content}
     rows = np.asarray(content.get("rows", np.empty((0, 0))), np.float64)
     if "targets" in content:
-        words["targets"] = np.asarray(content["targets"]).tolist()
+        facts["targets"] = np.asarray(content["targets"]).tolist()
     if looks is None or rows.ndim != 2 or not len(rows) or rows.shape[1] != looks.robot.dim:
-        return frame_parts.encode_facts("chunk", words, now)
+        return frame_parts.encode_facts("chunk", facts, now)
     if not np.isfinite(rows).all():
-        return frame_parts.encode_facts("chunk", words, now)
+        return frame_parts.encode_facts("chunk", facts, now)
     links = looks.poses(rows)
     arrays: dict[str, NDArray[Any]] = {"tips": looks.fingertip_positions(links)}
     if content.get("state") == "proposed":
-        shown = np.unique(np.linspace(0, len(rows) - 1, min(GHOSTS, len(rows))).round().astype(int))
-        words["ghost_rows"] = shown.tolist()
-        arrays["ghost"] = links[shown]
-    return frame_parts.encode_numbers("chunk", words, arrays, now)
+        ghost_rows = np.unique(np.linspace(0, len(rows) - 1, min(GHOSTS, len(rows))).round().astype(int))
+        facts["ghost_rows"] = ghost_rows.tolist()
+        arrays["ghost"] = links[ghost_rows]
+    return frame_parts.encode_numbers("chunk", facts, arrays, now)
 
 
 log = logging.getLogger(__name__)
@@ -95,16 +95,16 @@ class StreamEncoder:
 
     def _joints(self, content: Mapping[str, Any], now: float) -> list[EncodedPart]:
         vectors = {name: np.asarray(content[name], np.float32) for name in _VECTORS if name in content}
-        words = {key: content[key] for key in content if key not in vectors}
-        made = [
-            frame_parts.encode_numbers("joints", words, vectors, now),
-            self._recent.add_sample(vectors, words, now),
+        facts = {key: content[key] for key in content if key not in vectors}
+        parts = [
+            frame_parts.encode_numbers("joints", facts, vectors, now),
+            self._recent.add_sample(vectors, facts, now),
         ]
         if self.looks and _drawable(vectors["measured"], self.looks):
             rows = shown_rows(vectors, engaged=bool(content.get("engaged")))
             poses = self.looks.poses(rows)
-            made.append(frame_parts.encode_array("poses", poses if len(rows) > 1 else poses[0], now))
-        return made
+            parts.append(frame_parts.encode_array("poses", poses if len(rows) > 1 else poses[0], now))
+        return parts
 
 
 def shown_rows(vectors: Mapping[str, NDArray[Any]], *, engaged: bool) -> NDArray[np.float32]:
@@ -120,8 +120,8 @@ def shown_rows(vectors: Mapping[str, NDArray[Any]], *, engaged: bool) -> NDArray
     return np.stack([measured, commanded]) if sent else measured[None]
 
 
-def _drawable(joints: NDArray[Any], looks: DrawnRobot) -> bool:
-    return joints.shape == (looks.robot.dim,) and bool(np.isfinite(joints).all())
+def _drawable(joints: NDArray[Any], drawn: DrawnRobot) -> bool:
+    return joints.shape == (drawn.robot.dim,) and bool(np.isfinite(joints).all())
 
 
 def _drawn_robot(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot | None:

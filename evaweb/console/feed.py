@@ -61,10 +61,10 @@ class History:
 
     def extended(self, boot: str, rows: list[dict[str, Any]]) -> History:
         """Return the history with newer events appended; a new boot starts an empty history."""
-        known = self.rows if boot == self.boot else ()
-        last = known[-1]["number"] if known else 0
+        before = self.rows if boot == self.boot else ()
+        last = before[-1]["number"] if before else 0
         fresh = tuple(row for row in rows if row["number"] > last)
-        return History(boot, (*known, *fresh)[-EVENTS_KEPT:])
+        return History(boot, (*before, *fresh)[-EVENTS_KEPT:])
 
 
 class _Reader(ABC):
@@ -108,15 +108,15 @@ class _Reader(ABC):
 
     def _follow(self, endpoint: str) -> None:
         """Read until the runtime has another address."""
-        heard = looked = time.monotonic()
+        received_at = looked = time.monotonic()
         with closing(Subscriber(zmq.Context.instance(), endpoint, *self._streams)) as subscriber:
             while not self._ended.is_set():
-                found = self._receive(subscriber)
+                messages = self._receive(subscriber)
                 now = time.monotonic()
-                if found:
-                    heard = now
-                    self.on_messages(found)
-                elif now - heard > _SILENCE_S:
+                if messages:
+                    received_at = now
+                    self.on_messages(messages)
+                elif now - received_at > _SILENCE_S:
                     self.on_silence(
                         f"no sign of life from {self._wire.name}: was its runtime ended, or does it hang?"
                     )
@@ -264,18 +264,21 @@ class StationFeed:
 
     def _adjust(self) -> None:
         with self._lock:
-            wanted, pictures = bool(self._listeners), any(self._listeners.values())
-            self._numbers = self._switched(self._numbers, wanted, _StateReader)
+            is_watched, pictures = bool(self._listeners), any(self._listeners.values())
+            self._numbers = self._switched(self._numbers, is_watched, _StateReader)
             self._motion = self._switched(self._motion, pictures, _motion)
             self._pictures = self._switched(self._pictures, pictures, _pictures)
 
     def _switched(
-        self, reader: _Reader | None, wanted: bool, kind: Callable[[StationFeed, StationConnection], _Reader]
+        self,
+        reader: _Reader | None,
+        is_needed: bool,
+        kind: Callable[[StationFeed, StationConnection], _Reader],
     ) -> _Reader | None:
-        if wanted and reader is None:
+        if is_needed and reader is None:
             reader = kind(self, self._wire)
             reader.start()
-        elif not wanted and reader is not None:
+        elif not is_needed and reader is not None:
             reader.end()
             reader = None
         return reader

@@ -31,10 +31,10 @@ class TurnScheduler:
             self._soon(self._turn)
 
     def _turn(self) -> None:
-        taken = [self._waiting.popleft() for _ in range(min(self._most, len(self._waiting)))]
+        batch = [self._waiting.popleft() for _ in range(min(self._most, len(self._waiting)))]
         self._planned = False
         self._plan()  # first, so that failing work does not block the others
-        for work in taken:
+        for work in batch:
             work()
 
 

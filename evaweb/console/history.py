@@ -119,23 +119,29 @@ def _count(
 def _bars(title: str, unit: str, value: Callable[[Day], float | None], days: Sequence[Day]) -> Drawing:
     """Return a bar chart by day; a day without a value has no bar."""
     values = [value(day) for day in days]
-    high = max((one for one in values if one is not None), default=0.0) or 1.0
+    high = max((amount for amount in values if amount is not None), default=0.0) or 1.0
     axis = ticks(0.0, high, 2)
     top = axis[-1] if axis[-1] >= high else axis[-1] + (axis[1] - axis[0] if len(axis) > 1 else high)
     place = Scale(0.0, top, _TOP + _HEIGHT, _TOP)
     right = _LEFT + _STEP * len(days)
     parts = [line([(_LEFT, place(at)), (right, place(at))], "grid") for at in axis]
     parts += [words(_LEFT - 6, place(at) + 4, number(at), "end", "tick") for at in axis]
-    for n, (day, one) in enumerate(zip(days, values, strict=True)):
+    for n, (day, amount) in enumerate(zip(days, values, strict=True)):
         x = _LEFT + _STEP * n
         parts.append(words(x + _STEP / 2, _TOP + _HEIGHT + 16, f"{day.day:%a}", "middle", "tick"))
-        if one:
-            bar = {"x": x + 4, "y": place(one), "width": _STEP - 8, "height": _TOP + _HEIGHT - place(one)}
+        if amount:
+            bar = {
+                "x": x + 4,
+                "y": place(amount),
+                "width": _STEP - 8,
+                "height": _TOP + _HEIGHT - place(amount),
+            }
             parts.append(element("rect", class_="beam series-none", **bar))
     heading = f"{title} [{unit}]" if unit else title
-    said = "; ".join(
-        f"{day.day:%a} {'–' if one is None else number(one)}" for day, one in zip(days, values, strict=True)
+    text = "; ".join(
+        f"{day.day:%a} {'–' if amount is None else number(amount)}"
+        for day, amount in zip(days, values, strict=True)
     )
-    rows = [(f"{day.day:%Y-%m-%d}", one) for day, one in zip(days, values, strict=True)]
+    rows = [(f"{day.day:%Y-%m-%d}", amount) for day, amount in zip(days, values, strict=True)]
     size = (_WIDTH, _TOP + _HEIGHT + 24)
-    return drawing(*size, heading, said, *parts, kind="history", columns=("day", "value"), rows=rows)
+    return drawing(*size, heading, text, *parts, kind="history", columns=("day", "value"), rows=rows)

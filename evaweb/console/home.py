@@ -87,8 +87,8 @@ def now(*, user: Any, sight: Visibility) -> Now:
     )
 
 
-def _plan(row: PlanRow, user: Any, sight: Visibility) -> PlanNow:
-    sealed = sealed_reason(row.plan, user, sight)
+def _plan(row: PlanRow, user: Any, visibility: Visibility) -> PlanNow:
+    sealed = sealed_reason(row.plan, user, visibility)
     address = reverse("result-evidence", args=[row.plan.name, row.plan.version])
     return PlanNow(row, "" if sealed or not row.counted else address, sealed)
 
@@ -100,22 +100,24 @@ def _work(user: Any) -> Iterator[Item]:
     waiting = Q(status__in=(*UNFINISHED, TrialStatus.INTERRUPTED))
     begun = Trial.objects.filter(waiting, operator=user).select_related("scene", "position", "station")
     for trial in begun.order_by("-pk")[:MOST]:
-        what = f"Trial {trial.pk}, {trial.scene.title}, position {trial.position.number}: {trial.get_status_display()}"
+        title = f"Trial {trial.pk}, {trial.scene.title}, position {trial.position.number}: {trial.get_status_display()}"
         if trial.status in (TrialStatus.ENDED, TrialStatus.INTERRUPTED):
-            yield Item(what, reverse("result-trial", args=[trial.pk]), "Score it")
+            yield Item(title, reverse("result-trial", args=[trial.pk]), "Score it")
         else:
-            yield Item(what, reverse("station-eval", args=[trial.station.name]), f"At {trial.station}")
-    asked = VoidRequest.objects.filter(answer="").select_related("trial", "by").order_by("at")[:_VOIDS]
-    for one in [one for one in asked if can_answer_void(one.trial, user)][:MOST]:
-        words = f"{one.by.get_username()} asks for the void of trial {one.trial_id}: {one.reason:.80}"
-        yield Item(words, reverse("result-trial", args=[one.trial_id]), "Answer")
-    for one in _requests(user):
-        words = f"{one.user.get_username()} asks for {one.station}, which you command"
-        yield Item(words, reverse("station-eval", args=[one.station.name]), "Answer")
+            yield Item(title, reverse("station-eval", args=[trial.station.name]), f"At {trial.station}")
+    requests = VoidRequest.objects.filter(answer="").select_related("trial", "by").order_by("at")[:_VOIDS]
+    for request in [request for request in requests if can_answer_void(request.trial, user)][:MOST]:
+        text = (
+            f"{request.by.get_username()} asks for the void of trial {request.trial_id}: {request.reason:.80}"
+        )
+        yield Item(text, reverse("result-trial", args=[request.trial_id]), "Answer")
+    for request in _requests(user):
+        text = f"{request.user.get_username()} asks for {request.station}, which you command"
+        yield Item(text, reverse("station-eval", args=[request.station.name]), "Answer")
     count = unreviewed_episodes().order_by().count()
     if count:
-        words = f"{count} episode{'s are' if count > 1 else ' is'} waiting for a review"
-        yield Item(words, f"{reverse('replay-list')}?{urlencode({'review': 'unreviewed'})}", "Review")
+        text = f"{count} episode{'s are' if count > 1 else ' is'} waiting for a review"
+        yield Item(text, f"{reverse('replay-list')}?{urlencode({'review': 'unreviewed'})}", "Review")
 
 
 def _requests(user: Any) -> list[LeaseRequest]:
@@ -140,27 +142,29 @@ def alarms() -> Iterator[Item]:
         elif (
             stands.get("tone") == "danger"
         ):  # its cause may reveal the checkpoint: only the station's page shows it
-            words = f"{station} is {stands['label']}"
-            yield Item(words, reverse("station-eval", args=[station.name]), "Its page", grave=True)
+            text = f"{station} is {stands['label']}"
+            yield Item(text, reverse("station-eval", args=[station.name]), "Its page", grave=True)
         if lost := _cameras_lost(feed.state) if feed.link.ok else "":
-            words = f"{station} has no picture of {lost}"
-            yield Item(words, reverse("station-debug", args=[station.name]), "Its page", grave=True)
+            text = f"{station} has no picture of {lost}"
+            yield Item(text, reverse("station-debug", args=[station.name]), "Its page", grave=True)
     yield from _disk()
     yield from _recordings()
     failed = jobs_failed().count()
     if failed:
-        words = f"{failed} job{'s' if failed > 1 else ''} failed"
-        yield Item(words, f"{reverse('jobs')}?status=failed", "Look at them", grave=True)
+        text = f"{failed} job{'s' if failed > 1 else ''} failed"
+        yield Item(text, f"{reverse('jobs')}?status=failed", "Look at them", grave=True)
     waits = Job.objects.filter(
         status=JobStatus.QUEUED, created_at__lt=timezone.now() - WAITED, not_before=None
     )
-    having, asked = served(), waits.order_by("kind").values_list("kind", "queue").distinct()
-    lacking = list(dict.fromkeys(filter(None, (having.lacks_for(kind, queue) for kind, queue in asked))))
-    for words in lacking:
-        yield Item(words, reverse("jobs"), "Jobs", grave=True)
-    if not lacking and asked and not Job.objects.filter(status=JobStatus.RUNNING).exists():
-        words = "Jobs are waiting, but no worker takes them: does one hang?"
-        yield Item(words, reverse("jobs"), "Jobs", grave=True)
+    having, waiting_kinds = served(), waits.order_by("kind").values_list("kind", "queue").distinct()
+    lacking = list(
+        dict.fromkeys(filter(None, (having.lacks_for(kind, queue) for kind, queue in waiting_kinds)))
+    )
+    for text in lacking:
+        yield Item(text, reverse("jobs"), "Jobs", grave=True)
+    if not lacking and waiting_kinds and not Job.objects.filter(status=JobStatus.RUNNING).exists():
+        text = "Jobs are waiting, but no worker takes them: does one hang?"
+        yield Item(text, reverse("jobs"), "Jobs", grave=True)
 
 
 def _cameras_lost(state: Mapping[str, Any]) -> str:
@@ -175,16 +179,16 @@ def _cameras_lost(state: Mapping[str, Any]) -> str:
 def _disk() -> Iterator[Item]:
     total, _, free = shutil.disk_usage(settings.DATA_DIR)
     if free < FULL * total:
-        words = f"The disk of the lab is nearly full: {free / 1e9:.1f} GB of {total / 1e9:.0f} GB free"
-        yield Item(words, reverse("replay-list"), "Recordings", grave=True)
+        text = f"The disk of the lab is nearly full: {free / 1e9:.1f} GB of {total / 1e9:.0f} GB free"
+        yield Item(text, reverse("replay-list"), "Recordings", grave=True)
 
 
 def _recordings() -> Iterator[Item]:
     damaged, late = unverified()
     listed = reverse("replay-list")
     if damaged:
-        words = f"{damaged} recording{'s are' if damaged > 1 else ' is'} damaged"
-        yield Item(words, f"{listed}?quality=damaged", "Look at them", grave=True)
+        text = f"{damaged} recording{'s are' if damaged > 1 else ' is'} damaged"
+        yield Item(text, f"{listed}?quality=damaged", "Look at them", grave=True)
     if late:
-        words = f"{late} recording{'s were' if late > 1 else ' was'} not verified in time"
-        yield Item(words, reverse("jobs"), "Jobs")
+        text = f"{late} recording{'s were' if late > 1 else ' was'} not verified in time"
+        yield Item(text, reverse("jobs"), "Jobs")

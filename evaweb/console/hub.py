@@ -103,8 +103,8 @@ class StationRoom:
         """Return the redacted parts of a message; [] if every viewer may see the unredacted ones."""
         if not self._covers:
             return []
-        said = veil.redact_state(content, FULL_VISIBILITY) if stream == "state" else content
-        return self._covering.encode(stream, said)
+        redacted = veil.redact_state(content, FULL_VISIBILITY) if stream == "state" else content
+        return self._covering.encode(stream, redacted)
 
     def schedule_flush(self, after: float = _FLUSH_S) -> None:
         """Schedule a frame at least `after` [s] after the last one, with everything that arrives until then."""
@@ -169,18 +169,20 @@ class StationRoom:
             self._look_again = True
 
     async def _looked(self) -> None:
-        again = True
+        repeat = True
         try:
-            while again:
+            while repeat:
                 self._look_again = False
-                heard, viewers = self._unseen, list(self._viewers)
-                found = await sights.current_visibilities({viewer.user.pk: viewer.user for viewer in viewers})
+                unseen, viewers = self._unseen, list(self._viewers)
+                visibilities = await sights.current_visibilities(
+                    {viewer.user.pk: viewer.user for viewer in viewers}
+                )
                 for viewer in viewers:
-                    viewer.sight = found.get(viewer.user.pk, viewer.sight)
+                    viewer.sight = visibilities.get(viewer.user.pk, viewer.sight)
                     self._update_viewer(viewer)
-                self._history = heard
+                self._history = unseen
                 self.schedule_flush()
-                again = self._look_again
+                repeat = self._look_again
         finally:
             self._looking = None
 
@@ -188,29 +190,29 @@ class StationRoom:
         """Send the pending frames to all pages; pages with the same parts get the same bytes."""
         self._timer, self._flushed = None, self._loop.time()
         self._frames += 1
-        now, made = time.monotonic(), {}
+        now, frames = time.monotonic(), {}
 
         def make_frame(wanted: Iterable[EncodedPart]) -> bytes:
             chosen = tuple(sorted(wanted, key=lambda part: part.stream))
-            if chosen not in made:
-                made[chosen] = frame_parts.build_frame(chosen, self._frames, now)
-            return made[chosen]
+            if chosen not in frames:
+                frames[chosen] = frame_parts.build_frame(chosen, self._frames, now)
+            return frames[chosen]
 
         for viewer in self._viewers:
             viewer.flush(self._history, make_frame)
 
     async def _follow_changes(self) -> None:
         """Notify the pages of database changes by any process."""
-        known = None
+        marks_before = None
         while True:
             self._refresh_visibility()
-            found = await change_marks.read_marks(self.station)
-            if known is not None and found is not None and found != known:
-                what = change_marks.changed_names(known, found)
+            marks = await change_marks.read_marks(self.station)
+            if marks_before is not None and marks is not None and marks != marks_before:
+                names = change_marks.changed_names(marks_before, marks)
                 for viewer in self._viewers:
-                    viewer.put_changed(what)
+                    viewer.put_changed(names)
                 self.schedule_flush()
-            known = found or known
+            marks_before = marks or marks_before
             await asyncio.sleep(_CHANGES_S)
 
 
@@ -224,10 +226,10 @@ class LiveHub:
 
     def room(self, station: str, robot: str) -> StationRoom:
         """Return the station's room, created for its first page. Join it at once: an empty room is replaced."""
-        found = self._rooms.get(station)
-        if found is None or found.empty:
-            found = self._rooms[station] = StationRoom(station, robot, self._loop, self._feeds)
-        return found
+        room = self._rooms.get(station)
+        if room is None or room.empty:
+            room = self._rooms[station] = StationRoom(station, robot, self._loop, self._feeds)
+        return room
 
 
 _hubs: WeakKeyDictionary[asyncio.AbstractEventLoop, LiveHub] = WeakKeyDictionary()

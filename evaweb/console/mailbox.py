@@ -105,8 +105,8 @@ class Mailbox:
         rows: Sequence[Any] = history.after(self._events_after)
         covered: Sequence[Any] = ()
         if self.redacts_events:
-            heard, last = self._covered_up_to
-            covered = veil.redact_events(history.after(heard), self.sight, last)
+            number, last = self._covered_up_to
+            covered = veil.redact_events(history.after(number), self.sight, last)
             rows = [row for row in covered if row["number"] > self._events_after]
         for start in range(0, len(rows), EVENTS_AT_ONCE):
             some = rows[start : start + EVENTS_AT_ONCE]

@@ -81,20 +81,20 @@ class PageStops:
 
     async def _stop_of(self, request: Stop, at: datetime) -> None:
         try:
-            known = await credentials.resolve_stopper(self._found, self._share)
+            stopper = await credentials.resolve_stopper(self._found, self._share)
         except (Unverifiable, LookupOverload) as fault:
             unknown = stops.Answer(CommandStatus.FAILED, stops.UNKNOWN_STOPPER(why=fault))
             self._acknowledge(request.kind, request.uuid, unknown)
         else:
-            if known is not None:
-                self._stop(request, known[1], at)
+            if stopper is not None:
+                self._stop(request, stopper[1], at)
 
     def _press(self, request: EStop, login: Login | None, at: datetime, unverified: str = "") -> None:
-        why, uuid = request.why, request.uuid
+        reason, uuid = request.why, request.uuid
         username = login.username if login else UNVERIFIED
-        answer = stops.press_estop(station=self._station, username=username, why=why, uuid=uuid)
+        answer = stops.press_estop(station=self._station, username=username, why=reason, uuid=uuid)
         user = login.account if login else None
-        note = partial(commands.record_estop, user=user, why=why, uuid=uuid, at=at, unverified=unverified)
+        note = partial(commands.record_estop, user=user, why=reason, uuid=uuid, at=at, unverified=unverified)
         self._answer("estop", uuid, answer, note)
 
     def _stop(self, request: Stop, login: Login, at: datetime) -> None:
@@ -103,13 +103,13 @@ class PageStops:
             refused = stops.Answer(CommandStatus.REFUSED, stops.refused_to_a_viewer(login.username))
             self._acknowledge(request.kind, request.uuid, refused)
             return
-        given = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
-        answer = stops.request_stop(stops.stop_command(username=login.username, **given), self._station)
+        fields = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
+        answer = stops.request_stop(stops.stop_command(username=login.username, **fields), self._station)
         self._answer(
             request.kind,
             request.uuid,
             answer,
-            partial(commands.record_stop, user=login.account, at=at, **given),
+            partial(commands.record_stop, user=login.account, at=at, **fields),
         )
 
     def _answer(
@@ -123,12 +123,12 @@ class PageStops:
         self, kind: str, uuid: UUID, answer: Future[stops.Answer], note: Callable[..., object]
     ) -> None:
         try:
-            found = await asyncio.wrap_future(answer)
+            result = await asyncio.wrap_future(answer)
         finally:
             self._unanswered -= 1
-        self._acknowledge(kind, uuid, found)
-        note(station=Station(name=self._station), answer=found)
+        self._acknowledge(kind, uuid, result)
+        note(station=Station(name=self._station), answer=result)
 
     def _acknowledge(self, kind: str, uuid: UUID, answer: stops.Answer) -> None:
-        said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value}
-        self._say({"type": "ack", **said, **reasoned(answer.reason)})
+        fields = {"kind": kind, "uuid": str(uuid), "status": answer.status.value}
+        self._say({"type": "ack", **fields, **reasoned(answer.reason)})

@@ -26,11 +26,11 @@ async def until_read(
     least, since = None, clock()
     while (channel := request.channel) is not None:
         wire = channel.transport.transport  # the transport below our wrapper
-        held = unsent(wire)
-        if held <= AHEAD:
+        pending = unsent(wire)
+        if pending <= AHEAD:
             return
-        if least is None or held < least:
-            least, since = held, clock()
+        if least is None or pending < least:
+            least, since = pending, clock()
         elif clock() - since > STALLED_S:
             wire.abortConnection()
             return

@@ -50,23 +50,25 @@ class RecentSamples:
         if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
             self._samples.clear()  # another robot
         self._samples.append(sample)
-        columns = {key: [one.columns[key] for one in self._samples] for key in sample.columns}
-        arrays = {name: np.stack([one.curves[i] for one in self._samples]) for i, name in enumerate(_CURVES)}
+        columns = {key: [recent.columns[key] for recent in self._samples] for key in sample.columns}
+        arrays = {
+            name: np.stack([recent.curves[i] for recent in self._samples]) for i, name in enumerate(_CURVES)
+        }
         return frame_parts.encode_numbers(
-            "recent", {"t": [one.time for one in self._samples], **columns}, arrays, now
+            "recent", {"t": [recent.time for recent in self._samples], **columns}, arrays, now
         )
 
 
-def _sample(vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float) -> _Sample:
+def _sample(vectors: Mapping[str, NDArray[Any]], facts: Mapping[str, Any], now: float) -> _Sample:
     nothing = np.full_like(vectors["measured"], np.nan)
     simulated = vectors.get("simulated", nothing)
     in_simulation = bool(np.isfinite(simulated).all())
-    sent = vectors["commanded"] if words.get("engaged") else nothing
+    sent = vectors["commanded"] if facts.get("engaged") else nothing
     curves = (
         vectors["measured"],
         vectors.get("raw", nothing),
         vectors.get("planned", nothing),
         simulated if in_simulation else sent,
     )
-    said = {key: words.get(key, absent) for key, absent in _SAID.items()}
-    return _Sample(now, curves, {**said, "simulated": in_simulation})
+    columns = {key: facts.get(key, absent) for key, absent in _SAID.items()}
+    return _Sample(now, curves, {**columns, "simulated": in_simulation})

@@ -112,42 +112,42 @@ def parse(text: str, cameras: Collection[str]) -> Request:
     if press is not None:  # a press is accepted whatever else the message contains
         return EStop(_uuid(press), pressing.json_reason(press))
     try:
-        said = bounded.parse_json(text, "the message", _LARGEST, _MOST_VALUES)
+        message = bounded.parse_json(text, "the message", _LARGEST, _MOST_VALUES)
     except bounded.UnreadableDocument as error:
         raise BadRequest(f"{error} (given: {text!r:.60})") from None
-    kind = said.get("type") if isinstance(said, dict) else None
+    kind = message.get("type") if isinstance(message, dict) else None
     if kind == "watch":
-        return Watch(_streams(said, cameras))
+        return Watch(_streams(message, cameras))
     read = _READ.get(kind) if isinstance(kind, str) else None
     if read is None:
         raise BadRequest(_TYPE_UNKNOWN_ALLOWED_WATCH_ESTOP(kind=kind, read=", ".join(_READ)))
-    return read(said)
+    return read(message)
 
 
-def _streams(said: Mapping[str, Any], cameras: Collection[str]) -> tuple[str, ...]:
+def _streams(message: Mapping[str, Any], cameras: Collection[str]) -> tuple[str, ...]:
     allowed = (*STREAMS, *(f"camera/{camera}" for camera in cameras))
-    streams = said.get("streams")
+    streams = message.get("streams")
     if not isinstance(streams, list) or any(stream not in allowed for stream in streams):
         raise BadRequest(_STREAMS_ALLOWED_LIST(streams=streams, allowed=", ".join(allowed)))
     return tuple(streams)
 
 
-def _int_field(said: Mapping[str, Any], key: str) -> int:
-    value = said.get(key)
+def _int_field(message: Mapping[str, Any], key: str) -> int:
+    value = message.get(key)
     if type(value) is not int or not 0 <= value <= 2**53:
         raise BadRequest(_ALLOWED_WHOLE_NUMBER_FROM_0(key=key, value=value))
     return value
 
 
-def _map(said: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = said.get(key)
+def _map(message: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = message.get(key)
     if not isinstance(value, dict):
         raise BadRequest(_ALLOWED_MAP(key=key, value=value))
     return value
 
 
-def _text(said: Mapping[str, Any], key: str, default: str) -> str:
-    value = said.get(key) or default
+def _text(message: Mapping[str, Any], key: str, default: str) -> str:
+    value = message.get(key) or default
     if not isinstance(value, str):
         raise BadRequest(_ALLOWED_TEXT(key=key, value=value))
     return value
@@ -157,10 +157,10 @@ def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
     return lambda said: Stop(kind, _uuid(said), _int_field(said, "epoch"))
 
 
-def _uuid(said: Mapping[str, Any]) -> UUID:
+def _uuid(message: Mapping[str, Any]) -> UUID:
     """Return the uuid in the request, by which the page recognises the answer; a new uuid if it has no valid one."""
     try:
-        return UUID(str(said.get("uuid")))
+        return UUID(str(message.get("uuid")))
     except ValueError:
         return uuid4()
 

@@ -99,9 +99,9 @@ class EvalPanel:
 def last_used_station(*, session: SessionBase) -> Station | None:
     """Return the station that this browser last used, else the only station, else None."""
     used = session.get(SESSION_KEY)
-    found = Station.objects.filter(name=used).first() if used else None
-    if found is not None:
-        return found
+    station = Station.objects.filter(name=used).first() if used else None
+    if station is not None:
+        return station
     first_two = list(station_list()[:2])
     return first_two[0] if len(first_two) == 1 else None
 
@@ -120,14 +120,14 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
 
     If the description of the robot is unreadable, they are empty and "error" is the reason.
     """
-    found = describe_robot(robot)
+    description = describe_robot(robot)
     return {
-        "names": found["joint_names"],
-        "units": found["units"],
-        "grippers": found["gripper_dims"],
-        "cameras": found["cameras"],
-        "title": found["title"],
-        "error": found.get("error", ""),
+        "names": description["joint_names"],
+        "units": description["units"],
+        "grippers": description["gripper_dims"],
+        "cameras": description["cameras"],
+        "title": description["title"],
+        "error": description.get("error", ""),
     }
 
 
@@ -187,8 +187,8 @@ def _plan(plans: tuple[Plan, ...], name: str | None, last: Trial | None) -> Plan
 
 
 def _views(station: Station, trial: Trial | None) -> tuple[tuple[str, Reference | None], ...]:
-    known = references(station=station, position=trial.position if trial else None)
-    return tuple((camera, known.get(camera)) for camera in cameras_of(station))
+    by_camera = references(station=station, position=trial.position if trial else None)
+    return tuple((camera, by_camera.get(camera)) for camera in cameras_of(station))
 
 
 def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:

@@ -133,8 +133,8 @@ def _arrivals(files: int) -> ConnectionLimiter:
 
 def _address(listener: socket.socket) -> dict[str, Any]:
     host, port = listener.getsockname()[:2]
-    shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-    return {"url": f"http://{shown}:{port}", "host": host, "port": port}
+    displayed = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    return {"url": f"http://{displayed}:{port}", "host": host, "port": port}
 
 
 def _watch(server: Server) -> None:

@@ -59,9 +59,9 @@ def still(request: HttpRequest, name: str) -> HttpResponse:
 
     If there is none, the answer is empty (204), because that is not a fault.
     """
-    found = _station(name)
+    station = _station(name)
     try:
-        return HttpResponse(still_of(found), content_type="image/jpeg")
+        return HttpResponse(still_of(station), content_type="image/jpeg")
     except NotFound:
         return HttpResponse(status=204)
 
@@ -73,11 +73,11 @@ def station(request: HttpRequest, name: str) -> HttpResponse:
 
 def debug(request: HttpRequest, name: str) -> HttpResponse:
     """Render the page for operating a station manually: every command, every value."""
-    found, seen = _station(name), visibility_for_request(request)
-    if name in seen.busy_stations:
-        return _page(request, found, "redacted", {"why": seen.plans})
-    shown = {"checkpoints": checkpoint_list(sight=seen), **_replayed(request, found)}
-    return _page(request, found, "debug", shown)
+    station, visibility = _station(name), visibility_for_request(request)
+    if name in visibility.busy_stations:
+        return _page(request, station, "redacted", {"why": visibility.plans})
+    context = {"checkpoints": checkpoint_list(sight=visibility), **_replayed(request, station)}
+    return _page(request, station, "debug", context)
 
 
 def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
@@ -97,8 +97,8 @@ def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
 
 def evaluate(request: HttpRequest, name: str) -> HttpResponse:
     """Render a station's evaluation page with its current trial."""
-    found = _station(name)
-    return _page(request, found, "eval", _panel(request, found))
+    station = _station(name)
+    return _page(request, station, "eval", _panel(request, station))
 
 
 def panel(request: HttpRequest, name: str) -> HttpResponse:
@@ -108,21 +108,21 @@ def panel(request: HttpRequest, name: str) -> HttpResponse:
 
 def collect(request: HttpRequest, name: str) -> HttpResponse:
     """Render a station's collecting page with its current session."""
-    found = _station(name)
-    shown = {**collecting.session_panel(station=found), **collecting.progress_panel(station=found)}
-    return _page(request, found, "collect", shown)
+    station = _station(name)
+    context = {**collecting.session_panel(station=station), **collecting.progress_panel(station=station)}
+    return _page(request, station, "collect", context)
 
 
 def collect_session(request: HttpRequest, name: str) -> HttpResponse:
     """Render the session, or the form that opens one, as a fragment."""
-    found = _station(name)
-    return render(request, "collect/session.html", collecting.session_panel(station=found))
+    station = _station(name)
+    return render(request, "collect/session.html", collecting.session_panel(station=station))
 
 
 def collect_progress(request: HttpRequest, name: str) -> HttpResponse:
     """Render counts, last episode and queue as a fragment."""
-    found = _station(name)
-    return render(request, "collect/progress.html", collecting.progress_panel(station=found))
+    station = _station(name)
+    return render(request, "collect/progress.html", collecting.progress_panel(station=station))
 
 
 def lease(request: HttpRequest, name: str) -> HttpResponse:
@@ -147,10 +147,10 @@ def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, An
         **_lease(request, station),
         **extra,
     }
-    shown = render(request, f"console/{page}.html", context)
+    response = render(request, f"console/{page}.html", context)
     if stops:
-        shown._csp_update = {"connect-src": [stops]}  # type: ignore[attr-defined]
-    return shown
+        response._csp_update = {"connect-src": [stops]}  # type: ignore[attr-defined]
+    return response
 
 
 def _remember(request: HttpRequest, station: Station) -> None:
@@ -204,14 +204,14 @@ def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, 
 
 
 def _panel(request: HttpRequest, station: Station) -> dict[str, Any]:
-    found = selectors.eval_panel(
+    panel = selectors.eval_panel(
         station=station,
         user=request.user,
         sight=visibility_for_request(request),
         scene=request.GET.get("scene", ""),
         plan=request.GET.get("plan"),
     )
-    return {"panel": found, "station": station}
+    return {"panel": panel, "station": station}
 
 
 def _lease(request: HttpRequest, station: Station) -> dict[str, Any]:
@@ -220,5 +220,7 @@ def _lease(request: HttpRequest, station: Station) -> dict[str, Any]:
         "station": station,
         "role": role_of(request.user).value,
         "waiting": waiting,
-        "mine": next((one for one in waiting if one.user_id == request.user.pk), None),
+        "mine": next(
+            (request_row for request_row in waiting if request_row.user_id == request.user.pk), None
+        ),
     }

@@ -82,14 +82,14 @@ class Row:
 @require_GET
 def jobs(request: HttpRequest) -> HttpResponseBase:
     """Render running, queued and failed jobs; finished ones if requested."""
-    sight = visibility_for_request(request)
-    listing = Listing(request.GET, _columns(sight), _FILTERS)
-    found = jobs_listed(**listing.chosen)
+    visibility = visibility_for_request(request)
+    listing = Listing(request.GET, _columns(visibility), _FILTERS)
+    listed = jobs_listed(**listing.chosen)
     if listing.wants_file:
-        return listing.file(request, "jobs", found)
-    page = listing.page(found, PER_PAGE)
+        return listing.file(request, "jobs", listed)
+    page = listing.page(listed, PER_PAGE)
     having = served()
-    rows = [row_of(job, sight, having) for job in page]
+    rows = [row_of(job, visibility, having) for job in page]
     context = {
         "listing": listing,
         "page": page,
@@ -106,8 +106,8 @@ def job_act(request: HttpRequest, what: str) -> HttpResponse:
     user: Any = request.user
     try:
         require_role(user, Role.OPERATOR)
-        given = request.POST.get("job", "")
-        job = job_get(id=int(given) if given.isascii() and given.isdecimal() and len(given) < 16 else 0)
+        text = request.POST.get("job", "")
+        job = job_get(id=int(text) if text.isascii() and text.isdecimal() and len(text) < 16 else 0)
         if what == "cancel":
             services.cancel(user=user, job=job)
         else:
@@ -123,18 +123,18 @@ def row_of(job: Job, sight: Visibility, having: Served) -> Row:
 
     `having` are the queues that the running workers serve.
     """
-    title, lacks, said, cover = (
+    title, lacks, progress, cover = (
         KINDS.get(job.kind, job.kind),
         having.lacks(job),
         job.error or job.progress,
         cover_of(job, sight),
     )
     if cover is Cover.ALL:
-        return Row(job, title, "a blind trial", "", Pace(), HIDDEN if said else "", lacks, covered=True)
+        return Row(job, title, "a blind trial", "", Pace(), HIDDEN if progress else "", lacks, covered=True)
     about, address = _about(job)
     if cover is Cover.WORDS:
-        return Row(job, title, about, address, Pace(), HIDDEN if said else "", lacks)
-    return Row(job, title, about, address, pace_of(job), said, lacks)
+        return Row(job, title, about, address, Pace(), HIDDEN if progress else "", lacks)
+    return Row(job, title, about, address, pace_of(job), progress, lacks)
 
 
 def _about(job: Job) -> tuple[str, str]:
@@ -161,9 +161,9 @@ _FILTERS = (
 )
 
 
-def _columns(sight: Visibility) -> tuple[Column, ...]:
+def _columns(visibility: Visibility) -> tuple[Column, ...]:
     def shown(value: Callable[[Job], Any]) -> Callable[[Job], Any]:
-        return lambda job: "" if cover_of(job, sight) is Cover.ALL else value(job)
+        return lambda job: "" if cover_of(job, visibility) is Cover.ALL else value(job)
 
     return (
         Column("kind", "Job", ("kind", "key"), lambda job: job.kind),

@@ -16,11 +16,11 @@ _NO_LANGUAGE = Pattern("console.languages.none", "language {code!r:.20} is not t
 
 def catalogue(request: HttpRequest, code: str) -> HttpResponse:
     """Return the patterns of a language by id, as static/site/sentences.js reads them."""
-    found = language(code)
-    if found is None:
-        known = ", ".join(one.code for one in offered()) or "none but English"
-        raise NotFound(_NO_LANGUAGE(code=code, known=known))
-    answer = JsonResponse({"name": found.name, "sentences": dict(found.patterns)})
+    spoken = language(code)
+    if spoken is None:
+        codes = ", ".join(entry.code for entry in offered()) or "none but English"
+        raise NotFound(_NO_LANGUAGE(code=code, known=codes))
+    answer = JsonResponse({"name": spoken.name, "sentences": dict(spoken.patterns)})
     answer["Cache-Control"] = "no-cache"  # every page requests it; it is sent only if it has changed
     answer["ETag"] = f'"{hashlib.sha256(answer.content).hexdigest()[:32]}"'
     return get_conditional_response(request, etag=answer["ETag"], response=answer) or answer

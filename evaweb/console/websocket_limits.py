@@ -57,8 +57,8 @@ class LimitedWebSocket(WebSocketProtocol):  # type: ignore[misc]
             self._abort("too many pings")
         return allowed
 
-    def _abort(self, why: str) -> None:
-        self.wasNotCleanReason = why
+    def _abort(self, reason: str) -> None:
+        self.wasNotCleanReason = reason
         self.dropConnection(abort=True)
 
 
@@ -67,5 +67,5 @@ def unsent(transport: Any) -> int:
 
     Twisted offers no public count, hence the private attributes.
     """
-    held: int = len(transport.dataBuffer) - transport.offset + transport._tempDataLen
-    return held
+    size: int = len(transport.dataBuffer) - transport.offset + transport._tempDataLen
+    return size

@@ -118,8 +118,8 @@ class Frame:
         entry = self.header["streams"][name]
         where = entry if key is None else entry["arrays"][key]
         shape = tuple(where["shape"])
-        found = np.frombuffer(self.body, "<" + where["dtype"], math.prod(shape), where["offset"])
-        return found.reshape(shape)
+        values = np.frombuffer(self.body, "<" + where["dtype"], math.prod(shape), where["offset"])
+        return values.reshape(shape)
 
     def data(self, name: str) -> bytes:
         """Return the bytes of the file in stream `name`."""

@@ -45,31 +45,31 @@ class Bucket:
 
 def read_flag(name: str, default: bool) -> bool:
     """Return a boolean setting."""
-    given = os.environ.get(name)
-    if given is None:
+    text = os.environ.get(name)
+    if text is None:
         return default
-    word = given.strip().lower()
+    word = text.strip().lower()
     if word not in _TRUE + _FALSE:
-        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {', '.join(_TRUE + _FALSE[:-1])}")
+        raise ImproperlyConfigured(f"{name} = {text!r}; allowed: {', '.join(_TRUE + _FALSE[:-1])}")
     return word in _TRUE
 
 
 def read_list(name: str, default: tuple[str, ...] = ()) -> list[str]:
     """Return the items of a comma-separated setting."""
-    given = os.environ.get(name)
-    return list(default) if given is None else [word.strip() for word in given.split(",") if word.strip()]
+    text = os.environ.get(name)
+    return list(default) if text is None else [word.strip() for word in text.split(",") if word.strip()]
 
 
 def _number(name: str, default: float, least: float, most: float, allowed: str) -> float:
-    given = os.environ.get(name)
-    if given is None:
+    text = os.environ.get(name)
+    if text is None:
         return default
     try:
-        value = float(given)
+        value = float(text)
     except ValueError:
         value = math.nan
     if not least <= value <= most:
-        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {allowed}")
+        raise ImproperlyConfigured(f"{name} = {text!r}; allowed: {allowed}")
     return value
 
 
@@ -90,12 +90,12 @@ def gigabytes(name: str, default: float) -> float:
 
 def niceness(name: str, default: int) -> int:
     """Return a process niceness from 0 (normal priority) to 19 (lowest)."""
-    given = os.environ.get(name)
-    if given is None:
+    text = os.environ.get(name)
+    if text is None:
         return default
-    if not (given.isascii() and given.isdecimal() and int(given) <= 19):
-        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: 0 to 19")
-    return int(given)
+    if not (text.isascii() and text.isdecimal() and int(text) <= 19):
+        raise ImproperlyConfigured(f"{name} = {text!r}; allowed: 0 to 19")
+    return int(text)
 
 
 def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
@@ -103,61 +103,61 @@ def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
     try:
         return [ip_network(word) for word in read_list(name)]
     except ValueError as error:
-        given = os.environ[name]
+        text = os.environ[name]
         raise ImproperlyConfigured(
-            f"{name} = {given!r}: {error}; allowed: addresses and networks such as 127.0.0.1, 10.0.0.0/24"
+            f"{name} = {text!r}: {error}; allowed: addresses and networks such as 127.0.0.1, 10.0.0.0/24"
         ) from None
 
 
 def address(name: str) -> tuple[str, int] | None:
     """Return host and port of a setting HOST:PORT; None if it is not set."""
-    given = os.environ.get(name, "").strip()
-    if not given:
+    text = os.environ.get(name, "").strip()
+    if not text:
         return None
-    host, _, port = given.rpartition(":")
+    host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65535:
         raise ImproperlyConfigured(
-            f"{name} = {given!r}; allowed: HOST:PORT such as 0.0.0.0:8470, the port below 65535"
+            f"{name} = {text!r}; allowed: HOST:PORT such as 0.0.0.0:8470, the port below 65535"
         )
     return host.strip("[]"), int(port)
 
 
 def log_level(name: str, default: str) -> str:
     """Return the name of the lowest logged level."""
-    given = os.environ.get(name) or default
-    if given not in _LEVELS:
-        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {', '.join(_LEVELS)}")
-    return given
+    level = os.environ.get(name) or default
+    if level not in _LEVELS:
+        raise ImproperlyConfigured(f"{name} = {level!r}; allowed: {', '.join(_LEVELS)}")
+    return level
 
 
 def time_zone(name: str, default: str) -> str:
     """Return the name of the time zone in which pages show times."""
-    given = os.environ.get(name)
-    if not given:
+    zone = os.environ.get(name)
+    if not zone:
         return default
     try:
-        return ZoneInfo(given).key
+        return ZoneInfo(zone).key
     except (ZoneInfoNotFoundError, ValueError, OSError):  # unknown name, malformed name, folder of names
         raise ImproperlyConfigured(
-            f"{name} = {given!r}; allowed: names such as UTC, Europe/Berlin, Asia/Shanghai"
+            f"{name} = {zone!r}; allowed: names such as UTC, Europe/Berlin, Asia/Shanghai"
         ) from None
 
 
 def store() -> Path | Bucket | None:
     """Return the folder or bucket of EVA_STORE for large immutable files; None if it is not set."""
-    given = os.environ.get("EVA_STORE", "").strip()
-    if not given:
+    address = os.environ.get("EVA_STORE", "").strip()
+    if not address:
         return None
-    if not given.startswith("s3://"):
-        folder = Path(given).expanduser()
+    if not address.startswith("s3://"):
+        folder = Path(address).expanduser()
         if not folder.is_absolute() or not folder.is_dir():
             raise ImproperlyConfigured(
-                f"EVA_STORE = {given!r}; allowed: the path of a folder that is there, or s3://BUCKET/PREFIX"
+                f"EVA_STORE = {address!r}; allowed: the path of a folder that is there, or s3://BUCKET/PREFIX"
             )
         return folder
-    name, _, prefix = given.removeprefix("s3://").partition("/")
+    name, _, prefix = address.removeprefix("s3://").partition("/")
     if not re.fullmatch("[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]", name):
-        raise ImproperlyConfigured(f"EVA_STORE = {given!r}; allowed: s3://BUCKET or s3://BUCKET/PREFIX")
+        raise ImproperlyConfigured(f"EVA_STORE = {address!r}; allowed: s3://BUCKET or s3://BUCKET/PREFIX")
     if find_spec("obstore") is None:
         raise ImproperlyConfigured(
             "EVA_STORE names a bucket, and obstore is absent: .venv/bin/python -m pip install -e '.[s3]'"
@@ -173,14 +173,14 @@ def store() -> Path | Bucket | None:
 
 def _endpoint(name: str) -> str:
     """Return the origin in a setting, "" if it is not set; it is inserted unescaped into the security policy."""
-    given = os.environ.get(name, "").strip().rstrip("/")
-    parts = urlsplit(given)
+    origin = os.environ.get(name, "").strip().rstrip("/")
+    parts = urlsplit(origin)
     whole = f"{parts.scheme}://{parts.netloc}"
-    if given and (given != whole or not re.fullmatch(r"https?://[A-Za-z0-9.\[\]:-]+", given)):
+    if origin and (origin != whole or not re.fullmatch(r"https?://[A-Za-z0-9.\[\]:-]+", origin)):
         raise ImproperlyConfigured(
-            f"{name} = {given!r}; allowed: an origin such as https://s3.example.org:9000"
+            f"{name} = {origin!r}; allowed: an origin such as https://s3.example.org:9000"
         )
-    return given
+    return origin
 
 
 def require_driver(name: str, engine: str) -> None:
@@ -246,8 +246,8 @@ def _make_private(path: Path) -> None:
 
 def secret_key(folder: Path) -> str:
     """Return EVA_SECRET_KEY, else a key of the lab that is generated once and stored privately."""
-    given = os.environ.get("EVA_SECRET_KEY")
-    return given or _load_or_create(folder / "secret_key", partial(secrets.token_urlsafe, 50))
+    key = os.environ.get("EVA_SECRET_KEY")
+    return key or _load_or_create(folder / "secret_key", partial(secrets.token_urlsafe, 50))
 
 
 def lab_id(folder: Path) -> str:
@@ -256,12 +256,12 @@ def lab_id(folder: Path) -> str:
     Cookie names contain it, because cookies ignore ports: two labs on one host would overwrite each other's.
     """
     path = folder / "lab_id"
-    found = _load_or_create(path, partial(secrets.token_hex, 4))
-    if not re.fullmatch("[0-9A-Za-z]{1,32}", found):
+    text = _load_or_create(path, partial(secrets.token_hex, 4))
+    if not re.fullmatch("[0-9A-Za-z]{1,32}", text):
         raise ImproperlyConfigured(
-            f"{path}: {found!r:.60}; allowed: 1 to 32 letters and digits, or remove it, and everybody logs in anew"
+            f"{path}: {text!r:.60}; allowed: 1 to 32 letters and digits, or remove it, and everybody logs in anew"
         )
-    return found
+    return text
 
 
 def _load_or_create(path: Path, make: Callable[[], str]) -> str:
@@ -270,11 +270,11 @@ def _load_or_create(path: Path, make: Callable[[], str]) -> str:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
         _make_private(path)
-        found = path.read_text("utf-8").strip()
-        if not found:
+        text = path.read_text("utf-8").strip()
+        if not text:
             raise ImproperlyConfigured(f"{path} is empty: remove it, and everybody logs in anew") from None
-        return found
+        return text
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        made = make()
-        file.write(made)
-    return made
+        value = make()
+        file.write(value)
+    return value

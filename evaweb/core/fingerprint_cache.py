@@ -22,17 +22,17 @@ class FingerprintCache(Generic[T]):
     def get(self, key: Hashable, fingerprint: Hashable, make: Callable[[], T]) -> T:
         """Return the value of `key` at this `fingerprint`; call `make` if it is missing or outdated."""
         with self._lock:
-            found = self._rows.get(key)
-            if found is not None and found[0] == fingerprint:
+            row = self._rows.get(key)
+            if row is not None and row[0] == fingerprint:
                 self._rows.move_to_end(key)
-                return found[1]
-        made = make()  # outside the lock: concurrent callers both compute it, and neither waits
+                return row[1]
+        value = make()  # outside the lock: concurrent callers both compute it, and neither waits
         with self._lock:
-            self._rows[key] = (fingerprint, made)
+            self._rows[key] = (fingerprint, value)
             self._rows.move_to_end(key)
             while len(self._rows) > self._most:
                 self._rows.popitem(last=False)
-        return made
+        return value
 
     def renew(self, key: Hashable, make: Callable[[T | None], T]) -> T:
         """Replace the value of `key` by the result of `make`, and return it.
@@ -40,8 +40,8 @@ class FingerprintCache(Generic[T]):
         `make` gets the previous value, None if there is none. Concurrent callers each make a value.
         """
         with self._lock:
-            found = self._rows.get(key)
-        return self.get(key, object(), lambda: make(found[1] if found else None))
+            row = self._rows.get(key)
+        return self.get(key, object(), lambda: make(row[1] if row else None))
 
     def clear(self) -> None:
         """Drop all values."""

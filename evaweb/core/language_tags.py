@@ -48,25 +48,27 @@ class TextNode(template.Node):
         """Return the markup of the chosen language, else the English one."""
         request = context.get("request")
         spoken = languages.chosen(request) if request is not None else None
-        words = spoken.templates.get(self.id) if spoken is not None else None
-        if words is None:
+        pattern = spoken.templates.get(self.id) if spoken is not None else None
+        if pattern is None:
             return self.english.render(context)
-        shown = {name: self._shown(value, context, spoken) for name, value in self.values.items()}
-        return mark_safe(words.format_map(shown))
+        values = {name: self._shown(value, context, spoken) for name, value in self.values.items()}
+        return mark_safe(pattern.format_map(values))
 
     def _shown(self, value: FilterExpression, context: Any, spoken: languages.Language | None) -> str:
-        found = value.resolve(context)
-        if isinstance(found, str):
+        resolved = value.resolve(context)
+        if isinstance(resolved, str):
             of_a_choice = "_display" in value.token
-            found = languages.label(found, spoken) if of_a_choice else languages.translated(found, spoken)
-        return conditional_escape(found)
+            resolved = (
+                languages.label(resolved, spoken) if of_a_choice else languages.translated(resolved, spoken)
+            )
+        return conditional_escape(resolved)
 
 
 @register.tag("t")
 def text(parser: Parser, token: Token) -> TextNode:
     """Compile `{% t "id" name=value ... %}English{% endt %}`. Raises: TemplateSyntaxError for any other form."""
-    _, id, *rest = (*token.split_contents(), "")
-    values = token_kwargs(bits := [bit for bit in rest if bit], parser)
+    _, id, *further = (*token.split_contents(), "")
+    values = token_kwargs(bits := [bit for bit in further if bit], parser)
     if bits or len(id) < 3 or id[0] != id[-1] or id[0] not in "'\"":
         raise template.TemplateSyntaxError(
             f't: expected "an.id" and name=value pairs, given {token.contents}'

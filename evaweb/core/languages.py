@@ -46,7 +46,7 @@ def offered() -> list[Language]:
 
 def language(code: str) -> Language | None:
     """Return the language with this code, None if it is not installed."""
-    return next((one for one in offered() if one.code == code), None)
+    return next((row for row in offered() if row.code == code), None)
 
 
 def chosen(request: Any) -> Language | None:
@@ -54,14 +54,14 @@ def chosen(request: Any) -> Language | None:
     if not hasattr(request, "_eva_language"):
         code = request.COOKIES.get(COOKIE, "")
         request._eva_language = language(code) if _CODE.fullmatch(code) else None
-    found: Language | None = request._eva_language
-    return found
+    selected: Language | None = request._eva_language
+    return selected
 
 
 def parse(code: str, content: str) -> Language:
     """Return the language that a file describes. Raises: ValueError if its content is invalid."""
-    given = bounded.parse_json(content, "the language", _LARGEST, _MOST)
-    match given:
+    document = bounded.parse_json(content, "the language", _LARGEST, _MOST)
+    match document:
         case {"name": str(name), "sentences": dict(patterns), **rest}:
             templates = rest.get("templates", {})
         case _:
@@ -69,7 +69,7 @@ def parse(code: str, content: str) -> Language:
                 'expected {"name": its own name, "sentences": {id: pattern}, "templates": {id: words}}'
             )
     wrong = [
-        key for part in (patterns, templates) for key, words in part.items() if not isinstance(words, str)
+        key for part in (patterns, templates) for key, pattern in part.items() if not isinstance(pattern, str)
     ]
     if wrong:
         raise ValueError(f"{', '.join(wrong[:5])}: expected a text")
@@ -107,10 +107,10 @@ def _filled(pattern: str, arguments: Mapping[str, Any], spoken: Language | None)
 
 
 def _shown(value: Any, spec: str, conversion: str | None, spoken: Language | None) -> str:
-    shown = translated(value, spoken) if isinstance(value, str) else value
-    shown = repr(str.__str__(shown) if isinstance(shown, str) else shown) if conversion else shown
+    text = translated(value, spoken) if isinstance(value, str) else value
+    text = repr(str.__str__(text) if isinstance(text, str) else text) if conversion else text
     of_texts = spec.startswith(".") and spec[1:].isdigit()
-    return format(shown, spec if of_texts is isinstance(shown, str) else "")
+    return format(text, spec if of_texts is isinstance(text, str) else "")
 
 
 @lru_cache(maxsize=32)  # cache: of each file as it was last written

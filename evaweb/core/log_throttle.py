@@ -28,9 +28,9 @@ class LogThrottle:
         now = self._clock()
         with self._lock:
             entry = name if name in self._told or self._has_room(now) else _OTHERS
-            told, unsaid = self._told.get(entry, (-float("inf"), 0))
-            if now - told < self._every_s:
-                self._told[entry] = (told, unsaid + times)
+            logged_at, unsaid = self._told.get(entry, (-float("inf"), 0))
+            if now - logged_at < self._every_s:
+                self._told[entry] = (logged_at, unsaid + times)
                 return None
             self._told[entry] = (now, 0)
             self._told.move_to_end(entry)

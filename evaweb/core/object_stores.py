@@ -107,8 +107,8 @@ class FolderStore:
     def _at(self, digest: str) -> Path:
         return self.folder / digest[:2] / digest
 
-    def _failed(self, what: str, error: OSError) -> StoreError:
-        return StoreError(_FAILED(store=self.folder, what=what, why=error.strerror or str(error)))
+    def _failed(self, action: str, error: OSError) -> StoreError:
+        return StoreError(_FAILED(store=self.folder, what=action, why=error.strerror or str(error)))
 
 
 class S3Store:
@@ -188,11 +188,11 @@ class S3Store:
     def file(self, digest: str) -> Path | None:
         return None
 
-    def _failed(self, what: str, error: Exception) -> StoreError:
+    def _failed(self, action: str, error: Exception) -> StoreError:
         if isinstance(error, StoreError):
             return error
-        why = str(error).partition("\n")[0]  # further lines are internals of obstore
-        return StoreError(_FAILED(store=self._given, what=what, why=why))
+        reason = str(error).partition("\n")[0]  # further lines are internals of obstore
+        return StoreError(_FAILED(store=self._given, what=action, why=reason))
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,10 +215,10 @@ class LocalCache:
 
     def _bring(self, store: Store, digest: str, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft, found = _draft(self.folder, store.read(digest))
-        if found != digest:
+        draft, actual = _draft(self.folder, store.read(digest))
+        if actual != digest:
             draft.unlink()
-            raise _changed(store, digest, found)
+            raise _changed(store, digest, actual)
         os.replace(draft, path)
         self._trim()
 
@@ -235,10 +235,10 @@ class LocalCache:
 
 def the_store() -> Store | None:
     """Return the lab's store, None if large files stay in the data folder."""
-    given: Path | Bucket | None = settings.EVA_STORE
-    if given is None:
+    place: Path | Bucket | None = settings.EVA_STORE
+    if place is None:
         return None
-    return FolderStore(given) if isinstance(given, Path) else S3Store(given)
+    return FolderStore(place) if isinstance(place, Path) else S3Store(place)
 
 
 def required_store() -> Store:
@@ -256,15 +256,15 @@ def the_cache() -> LocalCache:
 
 def compared(store: Store, digest: str) -> None:
     """Read the object back and raise StoreError if it does not match its digest; call before deleting another copy."""
-    found = hashlib.sha256()
+    actual = hashlib.sha256()
     for part in store.read(digest):
-        found.update(part)
-    if found.hexdigest() != digest:
-        raise _changed(store, digest, found.hexdigest())
+        actual.update(part)
+    if actual.hexdigest() != digest:
+        raise _changed(store, digest, actual.hexdigest())
 
 
-def _changed(store: Store, digest: str, found: str) -> StoreError:
-    return StoreError(_CHANGED(digest=digest, store=type(store).__name__, why=found))
+def _changed(store: Store, digest: str, actual: str) -> StoreError:
+    return StoreError(_CHANGED(digest=digest, store=type(store).__name__, why=actual))
 
 
 def _parts(path: Path) -> Iterator[bytes]:

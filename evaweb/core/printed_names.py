@@ -17,9 +17,9 @@ def is_name(given: str) -> bool:
 
 def check_name(given: str) -> None:
     """Raise ValidationError if `given` contains a character that a name must not have."""
-    found = _REFUSED.search(given)
-    if found:
+    match = _REFUSED.search(given)
+    if match:
         raise ValidationError(
-            f"{given!a:.80} contains the character U+{ord(found[0]):04X}; allowed: one line of letters, digits, signs "
+            f"{given!a:.80} contains the character U+{ord(match[0]):04X}; allowed: one line of letters, digits, signs "
             "and blanks"
         )

@@ -82,8 +82,13 @@ def _arrow(hint: Any) -> Any:
 
     kinds = [kind for kind in get_args(hint) if kind is not type(None)] if _is_union(hint) else [hint]
     kind = kinds[0] if len(kinds) == 1 else str
-    known = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), datetime: pa.timestamp("us", tz="UTC")}
-    return known.get(kind, pa.string())
+    arrow_types = {
+        bool: pa.bool_(),
+        int: pa.int64(),
+        float: pa.float64(),
+        datetime: pa.timestamp("us", tz="UTC"),
+    }
+    return arrow_types.get(kind, pa.string())
 
 
 def _is_union(hint: Any) -> bool:

@@ -31,13 +31,13 @@ def when(moment: datetime | date | None, form: str = "Y-m-d H:i", nothing: str =
         return nothing
     if not isinstance(moment, datetime):
         return format_html('<time datetime="{}">{}</time>', moment.isoformat(), written(moment, form))
-    here = timezone.localtime(moment)
-    title = f"{here:%Y-%m-%d %H:%M:%S} {timezone.get_default_timezone_name()}{_offset(here)}"
+    local = timezone.localtime(moment)
+    title = f"{local:%Y-%m-%d %H:%M:%S} {timezone.get_default_timezone_name()}{_offset(local)}"
     return format_html(
         '<time datetime="{}" title="{}">{}</time>',
-        here.isoformat(timespec="seconds"),
+        local.isoformat(timespec="seconds"),
         title,
-        written(here, form),
+        written(local, form),
     )
 
 

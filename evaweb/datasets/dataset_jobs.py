@@ -71,14 +71,14 @@ def summarize_job(job: Job) -> JobSummary:
     if job.status == JobStatus.DONE and not result.get("done"):
         return JobSummary(job, title, "refused", str(result.get("why", "")))
     if job.status == JobStatus.DONE:
-        made = [result["dataset"]] if "dataset" in result else result.get("datasets", [])
-        return JobSummary(job, title, "done", _sentence(args["what"], result), tuple(made))
+        names = [result["dataset"]] if "dataset" in result else result.get("datasets", [])
+        return JobSummary(job, title, "done", _sentence(args["what"], result), tuple(names))
     if job.status == JobStatus.FAILED:
         return JobSummary(job, title, "failed", job.error)
     if job.status == JobStatus.RUNNING:
         return JobSummary(job, title, "running", job.progress or "it has begun")
-    words = f"tried again in a moment: {job.error}" if job.error else "for the worker"
-    return JobSummary(job, title, "waiting", waiting_for(job) or words)
+    reason = f"tried again in a moment: {job.error}" if job.error else "for the worker"
+    return JobSummary(job, title, "waiting", waiting_for(job) or reason)
 
 
 def _about(args: Mapping[str, Any]) -> str:
@@ -91,23 +91,23 @@ def _about(args: Mapping[str, Any]) -> str:
     return f"{about} to {args['repository']}" if args["what"] == "push" else about
 
 
-def _sentence(what: str, result: Mapping[str, Any]) -> str:
+def _sentence(action: str, result: Mapping[str, Any]) -> str:
     problems = result.get("problems") or []
-    if what in ("check", "repair"):
+    if action in ("check", "repair"):
         return "whole" if not problems else f"{_counted(len(problems), 'problem')}: {problems[0]}"
-    if what == "push":
+    if action == "push":
         return str(result.get("address", ""))
-    if what == "import":
-        said = f"{_counted(result['episodes'], 'episode')} can be reviewed, {result['made']} new"
-        return said + (f"; {problems[0]}" if problems else "")
+    if action == "import":
+        text = f"{_counted(result['episodes'], 'episode')} can be reviewed, {result['made']} new"
+        return text + (f"; {problems[0]}" if problems else "")
     parts = result.get("parts") or [result]
     episodes, rows = (sum(part[name] for part in parts) for name in ("episodes", "frames"))
-    said = f"{_counted(episodes, 'episode')}, {_counted(rows, 'row')}"
-    again = sum(len(part["encoded"]) for part in parts)
+    text = f"{_counted(episodes, 'episode')}, {_counted(rows, 'row')}"
+    encoded = sum(len(part["encoded"]) for part in parts)
     left = [thing for part in parts for thing in part["left_out"]]
-    said += f"; {_counted(again, 'video')} coded again" if again else ""
-    said += f"; left out: {'; '.join(left)}" if left else ""
-    return said + (f"; {problems[0]}" if problems else "")
+    text += f"; {_counted(encoded, 'video')} coded again" if encoded else ""
+    text += f"; left out: {'; '.join(left)}" if left else ""
+    return text + (f"; {problems[0]}" if problems else "")
 
 
 def _counted(count: int, thing: str) -> str:
@@ -123,5 +123,5 @@ def latest_check(name: str) -> LatestCheck | None:
         return None
     changed = datetime.fromtimestamp((get_dataset_folder(name) / layout.INFO).stat().st_mtime, UTC)
     since = job.finished_at if job.args["what"] == "repair" else job.claimed_at
-    said = (tuple(job.result.get(name, ())) for name in ("problems", "remarks"))
-    return LatestCheck(job.finished_at, *said, fresh=changed <= since)
+    messages = (tuple(job.result.get(name, ())) for name in ("problems", "remarks"))
+    return LatestCheck(job.finished_at, *messages, fresh=changed <= since)

@@ -182,8 +182,8 @@ def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:
     """Return the job's key: one check or repair per dataset at a time, but different keys for other orders."""
     if what in ("check", "repair"):
         return f"dataset:{what}:{_short(name)}"
-    rest = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]
-    return f"dataset:{what}:{_short(name)}:{rest}"
+    suffix = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]
+    return f"dataset:{what}:{_short(name)}:{suffix}"
 
 
 def _short(name: str) -> str:
@@ -193,13 +193,13 @@ def _short(name: str) -> str:
 def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
     """Return the full name of a new dataset. Raises: Conflict if it exists or is inside another dataset."""
     name = to if "/" in to else f"datasets/{to}"
-    for wanted in [f"{name}/{part}" for part in parts] or [name]:
-        folder = folder_named(wanted)
+    for path in [f"{name}/{part}" for part in parts] or [name]:
+        folder = folder_named(path)
         around = next((above for above in folder.parents if (above / INFO).is_file()), None)
         if around is not None:
-            raise Conflict(_WOULD_LIE_WITHIN_DATASET_CHOOSE(wanted=wanted, name=around.name))
+            raise Conflict(_WOULD_LIE_WITHIN_DATASET_CHOOSE(wanted=path, name=around.name))
         if folder.exists() and any(folder.iterdir()):
-            raise Conflict(_THERE_ALREADY_NOT_EMPTY_CHOOSE(wanted=wanted))
+            raise Conflict(_THERE_ALREADY_NOT_EMPTY_CHOOSE(wanted=path))
     return name
 
 

@@ -48,12 +48,12 @@ def list_rows(
     `success` is "yes", "no" or "unknown", `result` one of RESULTS, `verdict` one of VERDICTS; other values have no
     effect. Raises: RecordingError; EvaError for too many words.
     """
-    wanted = words_of(words.lower())
+    sought = words_of(words.lower())
     dataset = open_cached(name)
-    told = recorded_lines(dataset)
-    known = _known([str(line.get("uuid")) for line in told.values()])
-    found = [_row(dataset, listed, told.get(listed.index, {}), known) for listed in dataset.episodes]
-    return [row for row in found if _fits(row, wanted, success, result, verdict)]
+    lines = recorded_lines(dataset)
+    recordings = _known([str(line.get("uuid")) for line in lines.values()])
+    rows = [_row(dataset, listed, lines.get(listed.index, {}), recordings) for listed in dataset.episodes]
+    return [row for row in rows if _fits(row, sought, success, result, verdict)]
 
 
 def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
@@ -69,21 +69,23 @@ def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
 
 def _known(uuids: Sequence[str]) -> dict[str, Episode]:
     """Return the rows of these episodes in the database, by uuid."""
-    wanted = []
+    keys = []
     for uuid in uuids:
         try:
-            wanted.append(UUID(uuid))
+            keys.append(UUID(uuid))
         except ValueError:
             continue
-    found: dict[str, Episode] = {}
-    for first in range(0, len(wanted), 500):  # limit of query parameters
+    episodes: dict[str, Episode] = {}
+    for first in range(0, len(keys), 500):  # limit of query parameters
         chosen = Episode.objects.select_related("trial", "standing__review__reviewer")
-        found |= {str(row.uuid): row for row in chosen.filter(uuid__in=wanted[first : first + 500])}
-    return found
+        episodes |= {str(row.uuid): row for row in chosen.filter(uuid__in=keys[first : first + 500])}
+    return episodes
 
 
-def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[str, Episode]) -> DatasetRow:
-    uuid, success, outcome = str(told.get("uuid", "")), told.get("success"), told.get("outcome")
+def _row(
+    dataset: Dataset, listed: Any, line: Mapping[str, Any], recordings: Mapping[str, Episode]
+) -> DatasetRow:
+    uuid, success, outcome = str(line.get("uuid", "")), line.get("success"), line.get("outcome")
     return DatasetRow(
         index=listed.index,
         length=listed.length,
@@ -91,10 +93,10 @@ def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[
         task=", ".join(listed.tasks),
         uuid=uuid,
         success=success if isinstance(success, bool) else None,
-        result=result_of(told),
+        result=result_of(line),
         outcome=str(outcome.get("status", "")) if isinstance(outcome, Mapping) else "",
-        station=str(told.get("station", "")),
-        recording=known.get(uuid),
+        station=str(line.get("station", "")),
+        recording=recordings.get(uuid),
     )
 
 
@@ -105,12 +107,12 @@ def result_of(told: Mapping[str, Any]) -> str:
     return {True: "success", False: "fail"}.get(told.get("success"), "")  # type: ignore[call-overload,no-any-return]
 
 
-def _fits(row: DatasetRow, words: Sequence[str], success: str, result: str, verdict: str) -> bool:
+def _fits(row: DatasetRow, sought: Sequence[str], success: str, result: str, verdict: str) -> bool:
     text = f"{row.task} {row.uuid} {row.station}".lower()
-    wanted = {"yes": True, "no": False, "unknown": None}
+    success_of = {"yes": True, "no": False, "unknown": None}
     return (
-        all(word in text for word in words)
-        and (success not in wanted or row.success is wanted[success])
+        all(word in text for word in sought)
+        and (success not in success_of or row.success is success_of[success])
         and (result not in RESULTS or (row.result or "unknown") == result)
         and (verdict not in VERDICTS or (row.verdict or "unreviewed") == verdict)
     )

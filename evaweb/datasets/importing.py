@@ -54,16 +54,16 @@ def import_dataset(
     if target.resolve() != dataset.resolve():
         tell(f"{dataset} is copied to {target}")
     copied = copy_with_uuids(dataset, target, rename=rename, reencode=reencode, tell=tell)
-    told = resolve_source_robot(copied, state, robot)
-    uuids, made = [], 0
+    source_robot = resolve_source_robot(copied, state, robot)
+    uuids, created = [], 0
     for entry in copied.episodes:
         tell(f"episode {entry.index + 1} of {len(copied.episodes)}")
-        uuid, new = import_episode(copied, entry.index, episodes_dir(), told)
+        uuid, new = import_episode(copied, entry.index, episodes_dir(), source_robot)
         services.sync_episode(uuid=UUID(uuid))
         uuids.append(UUID(uuid))
-        made += new
+        created += new
     problems = sync_memberships()
-    return ImportResult(target.relative_to(data_dir()).as_posix(), tuple(uuids), made, tuple(problems))
+    return ImportResult(target.relative_to(data_dir()).as_posix(), tuple(uuids), created, tuple(problems))
 
 
 def _target(dataset: Path, to: str) -> Path:
@@ -71,10 +71,10 @@ def _target(dataset: Path, to: str) -> Path:
 
     Raises: EvaError if `to` is not a plain name.
     """
-    here, root = dataset.resolve(), datasets_dir().resolve()
-    if not to and here.parent == root:
-        return datasets_dir() / here.name
-    folder = folder_named(full_name(to) if to else f"datasets/{here.name}")
+    source, root = dataset.resolve(), datasets_dir().resolve()
+    if not to and source.parent == root:
+        return datasets_dir() / source.name
+    folder = folder_named(full_name(to) if to else f"datasets/{source.name}")
     if folder.parent != datasets_dir():
         raise EvaError(_ALLOWED_NAME_DATASETS_NAME_WHAT(to=to))
     return folder

@@ -25,7 +25,7 @@ def dataset(work: JobContext) -> Mapping[str, Any]:
     """
     try:
         work.hold(_names(work.args))
-        found = _KINDS[work.args["what"]](work)
+        result = _KINDS[work.args["what"]](work)
     except (RecordingError, EvaError) as fault:
         return {"done": False, "why": str(fault)}
     except Cancelled:  # the dataset may have changed before
@@ -33,8 +33,8 @@ def dataset(work: JobContext) -> Mapping[str, Any]:
             sync_memberships()
         raise
     if work.args["what"] not in _READ:
-        found["problems"] = [*found.get("problems", ()), *sync_memberships()]
-    return {"done": True, **found}
+        result["problems"] = [*result.get("problems", ()), *sync_memberships()]
+    return {"done": True, **result}
 
 
 def _names(args: Mapping[str, Any]) -> list[str]:
@@ -53,8 +53,8 @@ def _check(work: JobContext) -> Found:
     )  # imported late: web processes import this module but never run the job
 
     work.report_progress("every file is compared with the metadata")
-    found = check_with_remarks(_source(work))
-    return {"problems": found.problems, "remarks": found.remarks}
+    result = check_with_remarks(_source(work))
+    return {"problems": result.problems, "remarks": result.remarks}
 
 
 def _repair(work: JobContext) -> Found:
@@ -68,7 +68,7 @@ def _convert(work: JobContext) -> Found:
 
     args = work.args
     target = folder_named(args["to"])
-    made = convert(
+    result = convert(
         _source(work),
         target,
         args["version"],
@@ -76,15 +76,17 @@ def _convert(work: JobContext) -> Found:
         reencode=args["reencode"],
         tell=work.report_progress,
     )
-    return _result(args["to"], made)
+    return _result(args["to"], result)
 
 
 def _import(work: JobContext) -> Found:
     from evaweb.datasets.importing import import_dataset
 
     args = work.args
-    done = import_dataset(_source(work), state=args["state"], robot=args["robot"], tell=work.report_progress)
-    return {"dataset": done.dataset, "episodes": len(done.episodes), "made": done.made}
+    result = import_dataset(
+        _source(work), state=args["state"], robot=args["robot"], tell=work.report_progress
+    )
+    return {"dataset": result.dataset, "episodes": len(result.episodes), "made": result.made}
 
 
 def _merge(work: JobContext) -> Found:
@@ -93,8 +95,8 @@ def _merge(work: JobContext) -> Found:
     args = work.args
     sources = [get_dataset_folder(name) for name in args["datasets"]]
     target = folder_named(args["to"])
-    made = merge(sources, target, args["version"], reencode=args["reencode"], tell=work.report_progress)
-    return _result(args["to"], made)
+    result = merge(sources, target, args["version"], reencode=args["reencode"], tell=work.report_progress)
+    return _result(args["to"], result)
 
 
 def _split(work: JobContext) -> Found:
@@ -102,10 +104,10 @@ def _split(work: JobContext) -> Found:
 
     args = work.args
     targets = {folder_named(f"{args['to']}/{part}"): which for part, which in args["parts"].items()}
-    done = split(
+    results = split(
         _source(work), targets, args["version"], reencode=args["reencode"], tell=work.report_progress
     )
-    parts = [_result(f"{args['to']}/{one.dataset.name}", one) for one in done]
+    parts = [_result(f"{args['to']}/{result.dataset.name}", result) for result in results]
     return {"datasets": [part["dataset"] for part in parts], "parts": parts}
 
 
@@ -113,14 +115,14 @@ def _delete(work: JobContext) -> Found:
     from runtime.datasets.operations import delete
 
     args = work.args
-    made = delete(
+    result = delete(
         _source(work),
         args["episodes"],
         reencode=args["reencode"],
         known=args["known"],
         tell=work.report_progress,
     )
-    return _result(args["dataset"], made)
+    return _result(args["dataset"], result)
 
 
 def _push(work: JobContext) -> Found:
@@ -148,13 +150,13 @@ def _source(work: JobContext) -> Path:
     return get_dataset_folder(work.args["dataset"])
 
 
-def _result(name: str, made: Any) -> Found:
+def _result(name: str, written: Any) -> Found:
     """Return the job's result for an operation that wrote a dataset."""
     return {
         "dataset": name,
-        "version": made.version,
-        "episodes": made.episodes,
-        "frames": made.frames,
-        "encoded": list(made.encoded),
-        "left_out": list(made.left_out),
+        "version": written.version,
+        "episodes": written.episodes,
+        "frames": written.frames,
+        "encoded": list(written.encoded),
+        "left_out": list(written.left_out),
     }

@@ -30,7 +30,7 @@ COLUMNS = (
 
 def filters(found: Sequence[Overview]) -> list[Filter]:
     """Return the filters of the list of datasets."""
-    robots, versions = ({getattr(one, name) for one in found} - {""} for name in ("robot", "version"))
+    robots, versions = ({getattr(row, name) for row in found} - {""} for name in ("robot", "version"))
     return [
         Filter("words", "Words", kind=SEARCH, hint="of its name"),
         Filter("robot", "Robot", [(name, name) for name in sorted(robots)]),

@@ -135,9 +135,9 @@ def get_dataset_folder(name: str) -> Path:
     """Return the folder of an existing dataset. Raises: NotFound, which lists the existing ones."""
     folder = folder_named(name)
     if not (folder / layout.INFO).is_file():
-        there = dataset_names()
-        more = f", and {len(there) - 8} more" if len(there) > 8 else ""
-        raise NotFound(_THERE_NO_DATASET_THERE(name=name, there=", ".join(there[:8]) or "none", more=more))
+        names = dataset_names()
+        more = f", and {len(names) - 8} more" if len(names) > 8 else ""
+        raise NotFound(_THERE_NO_DATASET_THERE(name=name, there=", ".join(names[:8]) or "none", more=more))
     return folder
 
 

@@ -128,8 +128,8 @@ class PlayedEpisode:
         width, names = int((feature.get("shape") or [0])[0]), feature.get("names")
         if isinstance(names, Mapping) and len(names) == 1:  # some datasets use {"motors": [...]}
             names = next(iter(names.values()))
-        told = [str(name) for name in names] if isinstance(names, list) else []
-        return told if len(told) == width else [f"{column}[{k}]" for k in range(width)]
+        labels = [str(name) for name in names] if isinstance(names, list) else []
+        return labels if len(labels) == width else [f"{column}[{k}]" for k in range(width)]
 
     def sidecars(self) -> dict[str, Path]:
         """Return the sidecar files of the episode by kind."""
@@ -139,7 +139,7 @@ class PlayedEpisode:
 def load_played_episode(name: str, index: int, robot: str = "") -> PlayedEpisode:
     """Return episode `index` of a dataset, interpreted for `robot` if given. Raises: NotFound, RecordingError."""
     dataset = open_cached(name)
-    listed = next((one for one in dataset.episodes if one.index == index), None)
+    listed = next((entry for entry in dataset.episodes if entry.index == index), None)
     if listed is None:
         raise NotFound(_HAS_NO_EPISODE_THERE(name=name, index=index, count=len(dataset.episodes)))
     if robot and robot not in robots.robot_names():
@@ -202,16 +202,18 @@ def as_recording(shown: PlayedEpisode) -> Episode:
     )
 
 
-def _numbers(shown: PlayedEpisode, table: Any) -> tuple[list[str], Array, Array]:
+def _numbers(episode: PlayedEpisode, table: Any) -> tuple[list[str], Array, Array]:
     """Return joint names, and measured and commanded joints [N, D]; NaN for joints that a column lacks."""
-    state, action = shown.state, shown.action
+    state, action = episode.state, episode.action
     if not state and not action:
-        raise RecordingError(f"{shown.name} has no column of joints, neither measured nor commanded")
-    names = [shown.names(column) if column else [] for column in (state, action)]
-    values = [_values(table, column, len(told)) for column, told in zip((state, action), names, strict=True)]
+        raise RecordingError(f"{episode.name} has no column of joints, neither measured nor commanded")
+    names = [episode.names(column) if column else [] for column in (state, action)]
+    values = [
+        _values(table, column, len(labels)) for column, labels in zip((state, action), names, strict=True)
+    ]
     if len(names[0]) == len(names[1]):
         return names[0], values[0], values[1]
-    nothing = [np.full_like(one, np.nan) for one in values]
+    nothing = [np.full_like(columns, np.nan) for columns in values]
     joints = [*names[0], *(f"action {name}" for name in names[1])] if state else names[1]
     return joints, np.hstack([values[0], nothing[1]]), np.hstack([nothing[0], values[1]])
 
@@ -233,34 +235,34 @@ def _lists(values: Array) -> Any:
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def _manifest(shown: PlayedEpisode, joints: list[str]) -> dict[str, Any]:
+def _manifest(episode: PlayedEpisode, joints: list[str]) -> dict[str, Any]:
     return {
-        "uuid": shown.uuid or str(uuid5(NAMESPACE_URL, f"{shown.name}#{shown.index}")),
-        "fps": shown.fps,
-        "control_rate": shown.fps,
+        "uuid": episode.uuid or str(uuid5(NAMESPACE_URL, f"{episode.name}#{episode.index}")),
+        "fps": episode.fps,
+        "control_rate": episode.fps,
         "started_monotonic": 0.0,
-        "task": shown.task,
-        "robot": {"name": shown.robot, "dim": len(joints), "joint_names": _renamed_joints(shown, joints)},
+        "task": episode.task,
+        "robot": {"name": episode.robot, "dim": len(joints), "joint_names": _renamed_joints(episode, joints)},
         "streams": {},
         "cameras": {},
         "capture_streams": [],
     }
 
 
-def _renamed_joints(shown: PlayedEpisode, joints: list[str]) -> list[str]:
+def _renamed_joints(episode: PlayedEpisode, joints: list[str]) -> list[str]:
     """Return the joint names, those of the robot if the user has chosen one. Raises: NotFound if counts differ."""
-    if not shown.robot_is_assumed:
+    if not episode.robot_is_assumed:
         return joints
-    known = list(drawn_robot(shown.robot).robot.joint_names)
-    if len(known) != len(joints):
+    robot_joints = list(drawn_robot(episode.robot).robot.joint_names)
+    if len(robot_joints) != len(joints):
         raise NotFound(
-            _EPISODE_HAS_JOINTS_HAS_CHOOSE(count=len(joints), robot=shown.robot, count_2=len(known))
+            _EPISODE_HAS_JOINTS_HAS_CHOOSE(count=len(joints), robot=episode.robot, count_2=len(robot_joints))
         )
-    return known
+    return robot_joints
 
 
 def _episode(
-    shown: PlayedEpisode,
+    played: PlayedEpisode,
     form: Layout,
     manifest: Mapping[str, Any],
     rows: Any,
@@ -269,11 +271,11 @@ def _episode(
     raw: Any,
 ) -> Episode:
     return Episode(
-        path=shown.dataset.root,
+        path=played.dataset.root,
         layout=form,
         manifest=manifest,
         outcome=None,
-        frames=shown.frames,
+        frames=played.frames,
         rows=rows,
         ticks=ticks,
         smoothed=smoothed,
@@ -286,7 +288,7 @@ def _episode(
 # --- the three action streams --------------------------------------------------------------------------------
 
 
-def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
+def _with_streams(episode: PlayedEpisode, path: Path, rows: Any) -> Episode:
     """Return the episode with the raw, smoothed and executed streams of the sidecar file."""
     try:
         table = pq.read_table(path)
@@ -304,7 +306,7 @@ def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
             ("chunk_id",),
         )
         planned = _renamed(smoothed, {"smoothed": "action"}, ("step", "chunk_ids", "weights"), ())
-        meant = _renamed(
+        intended = _renamed(
             raw,
             {},
             (
@@ -322,7 +324,7 @@ def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
         )
     except (OSError, pa.ArrowException, KeyError, ValueError) as error:
         raise RecordingError(f"{path} is no table of action streams: {error}") from error
-    return _episode(shown, form, manifest, rows, ticks, planned, meant)
+    return _episode(episode, form, manifest, rows, ticks, planned, intended)
 
 
 def _renamed(table: Any, new: Mapping[str, str], same: tuple[str, ...], numbers: tuple[str, ...]) -> Any:

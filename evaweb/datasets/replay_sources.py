@@ -98,7 +98,7 @@ def dataset_address(route: str, episode: PlayedEpisode, *more: Any) -> str:
 
 def dataset_config(episode: PlayedEpisode) -> dict[str, Any]:
     """Return the settings of the page's modules, in the form of evaweb.episodes.views.replay_config."""
-    known = episode.robot in robots.robot_names()
+    is_described = episode.robot in robots.robot_names()
     videos = []
     for camera in episode.cameras:
         span = episode.video(camera)
@@ -113,9 +113,9 @@ def dataset_config(episode: PlayedEpisode) -> dict[str, Any]:
         )
     return {
         "curves": dataset_address("dataset-curves", episode),
-        "geometry": dataset_address("dataset-geometry", episode) if known else "",
+        "geometry": dataset_address("dataset-geometry", episode) if is_described else "",
         "why": ""
-        if known
+        if is_described
         else f"the dataset calls its robot {episode.robot or 'nothing'}: choose the one to be drawn under Details",
         "poses": dataset_address("dataset-poses", episode),
         "segments": dataset_address("dataset-segments", episode),

@@ -83,14 +83,16 @@ def side_by_side(request: HttpRequest) -> HttpResponse:
     names = list(dict.fromkeys(name.strip() for name in request.GET.getlist("show") if name.strip()))
     if len(names) > MOST:
         raise EvaError(_EPISODES_BESIDE_EACH_OTHER_ALLOWED(count=len(names), most=MOST))
-    found, problems = [], []
+    entries, problems = [], []
     for name in names:
         try:
-            found.append(resolve_entry(request, name))
+            entries.append(resolve_entry(request, name))
         except EvaError as error:
             problems.append(str(error))
-    config = player() | {"episodes": [{"name": one.name, "title": one.title, **one.config} for one in found]}
-    context = {"shown": found, "problems": problems, "config": config, "most": MOST}
+    config = player() | {
+        "episodes": [{"name": entry.name, "title": entry.title, **entry.config} for entry in entries]
+    }
+    context = {"shown": entries, "problems": problems, "config": config, "most": MOST}
     return render(request, "datasets/side_by_side.html", context)
 
 
@@ -148,8 +150,8 @@ def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
 def geometry_json(request: HttpRequest, name: str, index: int) -> HttpResponse:
     """Return the geometry of the robot for the 3D scene, as JSON."""
     episode = _episode(request, name, index)
-    found = _or_conflict(lambda: as_recording(episode))
-    robot = drawn_robot_for(found.manifest).robot
+    recording = _or_conflict(lambda: as_recording(episode))
+    robot = drawn_robot_for(recording.manifest).robot
     return JsonResponse(scene_geometry(robot.name, [group.name for group in robot.groups], simulated=False))
 
 
@@ -165,10 +167,10 @@ def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
 def segments(request: HttpRequest, name: str, index: int) -> HttpResponse:
     """Return the annotations and reviews in the dataset's sidecars, as JSON."""
     episode = _episode(request, name, index)
-    said = _or_conflict(
+    document = _or_conflict(
         lambda: {"segments": playback.annotations(episode), "reviews": playback.reviews(episode)}
     )
-    return JsonResponse(said)
+    return JsonResponse(document)
 
 
 def _episode(request: HttpRequest, name: str, index: int) -> PlayedEpisode:
@@ -183,10 +185,10 @@ def _recording(episode: PlayedEpisode) -> Episode | None:
 
 
 def _number(request: HttpRequest, name: str) -> int:
-    given = request.GET.get(name, "0")
-    if not (given.isascii() and given.isdecimal()) or len(given) > 9:
-        raise EvaError(_ALLOWED_WHOLE_NUMBER_FROM_0(name=name, given=given))
-    return int(given)
+    text = request.GET.get(name, "0")
+    if not (text.isascii() and text.isdecimal()) or len(text) > 9:
+        raise EvaError(_ALLOWED_WHOLE_NUMBER_FROM_0(name=name, given=text))
+    return int(text)
 
 
 def _or_conflict(make: Callable[[], Result]) -> Result:

@@ -85,8 +85,8 @@ class PlayableEpisode:
             return reverse("replay", args=[self.source])
         name, _, index = self.source.rpartition(":")
         path = reverse("dataset-replay", args=[name, int(index)])
-        said = not self.ours and self.robot in robots.robot_names()
-        return f"{path}?{urlencode({'robot': self.robot})}" if said else path
+        has_chosen_robot = not self.ours and self.robot in robots.robot_names()
+        return f"{path}?{urlencode({'robot': self.robot})}" if has_chosen_robot else path
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,14 +172,14 @@ def replay_command(
     require_role(user, Role.OPERATOR)
     if kind != "setup":
         raise EvaError(_TAKES_NO_REPLAY_SETUP_DOES(kind=kind))
-    found = make_offer(playable_episode(episode, robot), station, space)
-    if found.differences:
-        raise Conflict("; ".join(found.differences))
-    beside = dict(args or {})
-    doubled = sorted(found.set_up.keys() & beside.keys() - {"task"})
+    offer = make_offer(playable_episode(episode, robot), station, space)
+    if offer.differences:
+        raise Conflict("; ".join(offer.differences))
+    further = dict(args or {})
+    doubled = sorted(offer.set_up.keys() & further.keys() - {"task"})
     if doubled:
         raise EvaError(_ARGS_SAY_BESIDE_REPLAY_WHICH(doubled=", ".join(doubled)))
-    args = {**found.set_up, **beside}
+    args = {**offer.set_up, **further}
     return issue_command(user=user, station=station, kind=kind, args=args, vouched=("policy",), **given)
 
 
@@ -203,13 +203,13 @@ def _recording(uuid: UUID) -> PlayableEpisode:
     if row.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED(uuid=uuid))
     if row.damage:
-        raise Conflict(_EPISODE_DAMAGED(uuid=uuid, damage="; ".join(one["text"] for one in row.damage)))
+        raise Conflict(_EPISODE_DAMAGED(uuid=uuid, damage="; ".join(damage["text"] for damage in row.damage)))
     try:
         episode = open_episode(journal_folder(uuid))
     except RecordingError as error:
         raise Conflict(str(error)) from None
-    told = episode.manifest["robot"]
-    robot = told if isinstance(told, Mapping) else {}
+    table = episode.manifest["robot"]
+    robot = table if isinstance(table, Mapping) else {}
     has_poses = "eef_action" in episode.layout.streams
     return PlayableEpisode(
         source=str(uuid),
@@ -227,27 +227,27 @@ def _recording(uuid: UUID) -> PlayableEpisode:
     )
 
 
-def _of_dataset(shown: PlayedEpisode) -> PlayableEpisode:
-    features = shown.dataset.features
-    action = shown.action
+def _of_dataset(played: PlayedEpisode) -> PlayableEpisode:
+    features = played.dataset.features
+    action = played.action
     poses = next((name for name in ("eef_action", "action_eef") if name in features), "")
-    joints = shown.names(action) if action else []
-    if shown.robot_is_assumed:
-        known = describe_robot(shown.robot)["joint_names"]
-        joints = known if len(known) == len(joints) else joints
+    joints = played.names(action) if action else []
+    if played.robot_is_assumed:
+        robot_joints = describe_robot(played.robot)["joint_names"]
+        joints = robot_joints if len(robot_joints) == len(joints) else joints
     return PlayableEpisode(
-        source=f"{shown.name}:{shown.index}",
-        title=shown.task or "Episode without a task",
-        path=str(shown.dataset.root.absolute()),
-        index=shown.index,
-        rows=shown.frames,
-        fps=shown.fps,
-        task=shown.task,
-        robot=shown.robot,
+        source=f"{played.name}:{played.index}",
+        title=played.task or "Episode without a task",
+        path=str(played.dataset.root.absolute()),
+        index=played.index,
+        rows=played.frames,
+        fps=played.fps,
+        task=played.task,
+        robot=played.robot,
         joints=joints,
-        poses=shown.names(poses) if poses else (),
+        poses=played.names(poses) if poses else (),
         columns={"joint": action, "eef": poses},
-        ours=bool(shown.uuid) and shown.told.get("kind") != IMPORTED and not shown.robot_is_assumed,
+        ours=bool(played.uuid) and played.told.get("kind") != IMPORTED and not played.robot_is_assumed,
     )
 
 
@@ -272,27 +272,36 @@ def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
 
 def _differences(recorded: PlayableEpisode, facts: Mapping[str, Any], space: str) -> list[str]:
     """Return all differences between the episode's robot and the station's; [] if there are none."""
-    found = []
+    sentences = []
     own = str(facts.get("robot", ""))
     if recorded.robot not in robots.robot_names():
         called = f"calls its robot {recorded.robot!r}" if recorded.robot else "names no robot"
         return [f"the episode {called}: choose its robot on its page in Replay, then come back"]
     if recorded.robot != own:
-        found.append(f"the episode is of the robot {recorded.robot}, the station has {own}")
-    theirs, ours = list(recorded.joints), [str(name) for name in facts.get("joint_names", ())]
-    groups = [list(dict.fromkeys(name.partition(".")[0] for name in names)) for names in (theirs, ours)]
+        sentences.append(f"the episode is of the robot {recorded.robot}, the station has {own}")
+    recorded_joints, station_joints = (
+        list(recorded.joints),
+        [str(name) for name in facts.get("joint_names", ())],
+    )
+    groups = [
+        list(dict.fromkeys(name.partition(".")[0] for name in names))
+        for names in (recorded_joints, station_joints)
+    ]
     if groups[0] != groups[1]:
-        found.append(
+        sentences.append(
             f"the episode has the groups {', '.join(groups[0]) or 'none'}, the station {', '.join(groups[1])}"
         )
-    elif theirs != ours:
-        found.append(
-            f"the episode has the joints {', '.join(theirs) or 'none'}, the station {', '.join(ours)}"
+    elif recorded_joints != station_joints:
+        sentences.append(
+            f"the episode has the joints {', '.join(recorded_joints) or 'none'}, "
+            f"the station {', '.join(station_joints)}"
         )
     if space == "eef" and not recorded.poses:
-        found.append("the episode has no poses of its actions: send joints")
+        sentences.append("the episode has no poses of its actions: send joints")
     elif space == "eef" and not recorded.ours:
-        found.append("the frames of its poses are not known, because it was not recorded here: send joints")
+        sentences.append(
+            "the frames of its poses are not known, because it was not recorded here: send joints"
+        )
     elif space == "eef" and list(facts.get("eef_names", recorded.poses)) != list(recorded.poses):
-        found.append(f"the episode has the poses {', '.join(recorded.poses)}, the station others")
-    return found
+        sentences.append(f"the episode has the poses {', '.join(recorded.poses)}, the station others")
+    return sentences

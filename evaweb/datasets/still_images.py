@@ -57,13 +57,13 @@ def _stored(episode: PlayedEpisode, key: str, row: int) -> bytes:
         table = pq.read_table(path, columns=columns)
         if episode.entry.shared:
             table = table.filter(pc.equal(table["episode_index"], episode.index))
-        found = table[key][row].as_py()
+        picture = table[key][row].as_py()
     except (OSError, pa.ArrowException, KeyError, IndexError) as error:
         raise RecordingError(f"{path}: no picture {row} of {key!r}: {error}") from error
-    stored = stored_row(found)
+    stored = stored_row(picture)
     if stored is None or not (stored.get("bytes") or stored.get("path")):
         raise RecordingError(
-            f"{path}: picture {row} of {key!r} is {type(found).__name__}, expected a coded picture"
+            f"{path}: picture {row} of {key!r} is {type(picture).__name__}, expected a coded picture"
         )
     if stored.get("bytes"):
         return bytes(stored["bytes"])

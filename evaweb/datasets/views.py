@@ -47,14 +47,14 @@ _INDICES = re.compile(r"[0-9]{1,9}(,[0-9]{1,9}){0,199}")
 @require_GET
 def dataset_list(request: HttpRequest) -> HttpResponseBase:
     """Show all datasets in the data folder."""
-    found = overviews()
-    shown = Listing(request.GET, listed.COLUMNS, listed.filters(found))
-    fits = shown.sorted([one for one in found if listed.fits(one, **shown.chosen)])
-    if shown.wants_file:
-        return shown.file(request, "datasets", fits)
-    page = Paginator(fits, PER_PAGE).get_page(shown.number)
-    rows = [(one, None if one.problem else dataset_jobs.latest_check(one.name)) for one in page]
-    context = {"listing": shown, "page": page, "rows": rows, "name": "", **_work(""), **_rights(request)}
+    datasets = overviews()
+    listing = Listing(request.GET, listed.COLUMNS, listed.filters(datasets))
+    fits = listing.sorted([row for row in datasets if listed.fits(row, **listing.chosen)])
+    if listing.wants_file:
+        return listing.file(request, "datasets", fits)
+    page = Paginator(fits, PER_PAGE).get_page(listing.number)
+    rows = [(row, None if row.problem else dataset_jobs.latest_check(row.name)) for row in page]
+    context = {"listing": listing, "page": page, "rows": rows, "name": "", **_work(""), **_rights(request)}
     return render(request, "datasets/list.html", context)
 
 
@@ -62,23 +62,23 @@ def dataset_list(request: HttpRequest) -> HttpResponseBase:
 def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
     """Show one dataset: its overview, episodes and operations."""
     name = dataset_orders.full_name(name)
-    shown = Listing(request.GET, listed.EPISODE_COLUMNS, listed.EPISODE_FILTERS)
-    found = overview(name)
+    listing = Listing(request.GET, listed.EPISODE_COLUMNS, listed.EPISODE_FILTERS)
+    row = overview(name)
     rows: list[episode_list.DatasetRow] = []
-    problem = found.problem
+    problem = row.problem
     if not problem:
         try:
-            rows = shown.sorted(episode_list.list_rows(name, **shown.chosen))
+            rows = listing.sorted(episode_list.list_rows(name, **listing.chosen))
         except RecordingError as error:
             problem = str(error)
-    if shown.wants_file and not problem:
-        return shown.file(request, PurePosixPath(name).name, rows)
+    if listing.wants_file and not problem:
+        return listing.file(request, PurePosixPath(name).name, rows)
     context = {
-        "dataset": found,
+        "dataset": row,
         "problem": problem,
         "checked": None if problem else dataset_jobs.latest_check(name),
-        "page": Paginator(rows, PER_PAGE).get_page(shown.number),
-        "listing": shown,
+        "page": Paginator(rows, PER_PAGE).get_page(listing.number),
+        "listing": listing,
         "robots": robots.robot_names(),
         "name": name,
         "chosen": _chosen(request.GET.get("chosen", "")),
@@ -88,18 +88,18 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
     return render(request, "datasets/dataset.html", context)
 
 
-def _chosen(given: str) -> str:
+def _chosen(text: str) -> str:
     """Return the indices of episodes selected on another page. Raises: EvaError if malformed."""
-    if given and not _INDICES.fullmatch(given):
-        raise EvaError(f"chosen = {given!r:.80}; allowed: indices of episodes, separated by commas")
-    return given
+    if text and not _INDICES.fullmatch(text):
+        raise EvaError(f"chosen = {text!r:.80}; allowed: indices of episodes, separated by commas")
+    return text
 
 
 @require_GET
 def dataset_work(request: HttpRequest) -> HttpResponse:
     """Return the newest jobs as a fragment; if no job is active, make the page reload."""
-    given = request.GET.get("dataset", "")
-    name = dataset_orders.full_name(given) if given else ""
+    text = request.GET.get("dataset", "")
+    name = dataset_orders.full_name(text) if text else ""
     context = {"name": name, **_work(name)}
     answer = render(request, "datasets/work.html", context)
     if not context["passing"]:
@@ -122,25 +122,25 @@ def dataset_ask(request: HttpRequest) -> HttpResponse:
 
 def _order(form: QueryDict) -> Mapping[str, Any]:
     """Convert a form, whose fields are text, to an order."""
-    what = form.get("what", "")
-    order: dict[str, Any] = {"what": what}
-    if what == "merge":
+    action = form.get("what", "")
+    order: dict[str, Any] = {"what": action}
+    if action == "merge":
         order["datasets"] = form.getlist("datasets")
     else:
         order["dataset"] = form.get("dataset", "")
     for key in ("to", "version", "repository", "robot", "state"):
         if form.get(key, "").strip():
             order[key] = form[key].strip()
-    if what == "convert":
+    if action == "convert":
         order["rename"] = _pairs("rename", form.get("rename", ""))
-    if what == "split":
+    if action == "split":
         order["parts"] = _parts(form.get("parts", ""))
-    if what == "delete":
+    if action == "delete":
         _require_confirmed(form)
         order["episodes"] = [int(index) for index in form.getlist("episodes") if is_index(index)]
-    if what in ("convert", "merge", "split", "delete"):
+    if action in ("convert", "merge", "split", "delete"):
         order["reencode"] = form.get("reencode") == "on"
-    if what == "push":
+    if action == "push":
         order["private"] = form.get("public") != "on"
     return order
 

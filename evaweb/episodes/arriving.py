@@ -43,20 +43,20 @@ def owner_of(uuid: str) -> str:
 def whereabouts(episode: Episode) -> str:
     """Return a message that says where an episode in transfer is, and how much of it has arrived."""
     name = episode.station.name
-    found = progress_of(data_dir(), name, str(episode.uuid))
-    if found is None:
+    progress = progress_of(data_dir(), name, str(episode.uuid))
+    if progress is None:
         return _NOT_HERE(station=name)
-    if found.why:
-        return _DECLINED(station=name, why=found.why.rstrip("."))
-    return _PARTLY_HERE(station=name, here=_megabytes(found.here), size=_megabytes(found.size))
+    if progress.why:
+        return _DECLINED(station=name, why=progress.why.rstrip("."))
+    return _PARTLY_HERE(station=name, here=_megabytes(progress.here), size=_megabytes(progress.size))
 
 
 def ingest_arrived() -> int:
     """Create rows of newly arrived episodes and labels; return the number of episodes."""
     marks = {UUID(uuid): mark for uuid, mark in arrivals(data_dir())}
     waited_for = Episode.objects.filter(away_since__isnull=False).values_list("uuid", flat=True)
-    here = {uuid for uuid in waited_for if journal_folder(uuid).is_dir()}
-    for uuid in here.union(marks):
+    arrived = {uuid for uuid in waited_for if journal_folder(uuid).is_dir()}
+    for uuid in arrived.union(marks):
         for problem in ingest_one(uuid):
             log.warning("episode %s has arrived: %s", uuid, problem)
         episode = Episode.objects.filter(uuid=uuid, away_since=None).first()
@@ -64,7 +64,7 @@ def ingest_arrived() -> int:
             services.request_publish(episode=episode)  # an earlier job found nothing to publish
         if uuid in marks:
             marks[uuid].unlink(missing_ok=True)
-    return len(here.union(marks))
+    return len(arrived.union(marks))
 
 
 def _megabytes(count: int) -> str:

@@ -17,8 +17,8 @@ def bench_course(folder: Path) -> list[dict[str, Any]]:
     damaged file.
     """
     course: list[dict[str, Any]] = []
-    for row, said in truth_changes(open_episode(folder).rows):
-        lies = {key: value for key, value in said.items() if key != JUDGED}
+    for row, change in truth_changes(open_episode(folder).rows):
+        lies = {key: value for key, value in change.items() if key != JUDGED}
         if not course or lies != {key: value for key, value in course[-1].items() if key != "row"}:
             course.append({"row": row, **lies})
     return course
@@ -26,9 +26,9 @@ def bench_course(folder: Path) -> list[dict[str, Any]]:
 
 def milestones_reached(episode: Episode) -> Iterator[tuple[str, int]]:
     """Yield (name, row) of every milestone that the ground truth reports; `row` is the first at which it is reached."""
-    known: set[str] = set()
-    for row, said in truth_changes(episode.rows):
-        reached = {name for name, yes in (said.get(JUDGED) or {}).items() if yes is True}
-        for name in sorted(reached - known):
+    reached_before: set[str] = set()
+    for row, change in truth_changes(episode.rows):
+        reached = {name for name, yes in (change.get(JUDGED) or {}).items() if yes is True}
+        for name in sorted(reached - reached_before):
             yield name, row
-        known |= reached
+        reached_before |= reached

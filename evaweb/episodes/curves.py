@@ -65,15 +65,15 @@ def curve_streams(
     start = _start(episode)
     if covered:
         episode = _redacted(episode)
-    made, makers = _contribution_ranges(episode)
+    contributions, makers = _contribution_ranges(episode)
     streams = {
-        "ticks": _ticks(episode, start, made),
+        "ticks": _ticks(episode, start, contributions),
         "makers": makers,
         "raw": _raw(episode, start),
         "chunks": chunk_arrays(episode, lambda steps: _times_of(episode, steps) - start),
     }
     names = robot_of_manifest(episode.manifest).get("joint_names")
-    held = hold_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps)
+    holds = hold_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps)
     return encode(
         streams,
         joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
@@ -81,11 +81,11 @@ def curve_streams(
         frames=episode.frames,
         fps=episode.layout.fps,
         period=_period(episode),
-        held=held,
+        held=holds,
         marks=[
             *_marks(episode, start, _JUDGED if unscored else ()),
             *_interventions(episode),
-            *_milestones(episode, unscored, [(_played(at, held), words) for at, words in milestones]),
+            *_milestones(episode, unscored, [(_played(at, holds), label) for at, label in milestones]),
         ],
     )
 
@@ -112,10 +112,10 @@ def _redacted(episode: Episode) -> Episode:
 def _numbers(episode: Episode) -> dict[str, Any]:
     """Return the `units` of the joints and the indices of `grippers`; unknown if the robot has changed since."""
     try:
-        looks = drawn_robot_for(episode.manifest)
+        drawn = drawn_robot_for(episode.manifest)
     except NotFound:
         return {"units": [""] * episode.layout.dim, "grippers": []}
-    return {"units": list(looks.units), "grippers": list(looks.robot.gripper_dims)}
+    return {"units": list(drawn.units), "grippers": list(drawn.robot.gripper_dims)}
 
 
 def _start(episode: Episode) -> float:
@@ -130,28 +130,28 @@ def vectors(table: Any, name: str, width: int) -> Array:
     """Return a column of vectors joint by joint: float32 [W, N], NaN if null."""
     column = table.column(name).combine_chunks()
     values = np.full((table.num_rows, width), np.nan, np.float32)
-    known = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), bool)
-    values[known] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+    valid = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), bool)
+    values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
     return np.ascontiguousarray(values.T)
 
 
 def _requested_rows(episode: Episode) -> tuple[Array, Array]:
     """Return for each row of the smoothed stream its tick, and whether that was recorded."""
     steps = episode.ticks.column("step").to_numpy()
-    asked = episode.smoothed.column("step").to_numpy()
-    places = np.searchsorted(steps, asked)
-    known = places < len(steps)
-    known[known] = steps[places[known]] == asked[known]
-    return places, known
+    requested = episode.smoothed.column("step").to_numpy()
+    places = np.searchsorted(steps, requested)
+    recorded = places < len(steps)
+    recorded[recorded] = steps[places[recorded]] == requested[recorded]
+    return places, recorded
 
 
 def _contribution_ranges(episode: Episode) -> tuple[Array, Stream]:
     """Return the boundaries of each tick's contributions (int32 [M + 1]), and all contributions in order."""
-    places, known = _requested_rows(episode)
-    table = episode.smoothed.filter(known)
+    places, recorded = _requested_rows(episode)
+    table = episode.smoothed.filter(recorded)
     chunk_ids, weights = (table.column(name).combine_chunks() for name in ("chunk_ids", "weights"))
     counts = np.zeros(episode.ticks.num_rows, np.int64)
-    counts[places[known]] = chunk_ids.value_lengths().to_numpy(zero_copy_only=False)
+    counts[places[recorded]] = chunk_ids.value_lengths().to_numpy(zero_copy_only=False)
     arrays = {
         "chunk": chunk_ids.flatten().to_numpy(zero_copy_only=False).astype(np.int32),
         "weight": weights.flatten().to_numpy(zero_copy_only=False).astype(np.float32),
@@ -159,11 +159,11 @@ def _contribution_ranges(episode: Episode) -> tuple[Array, Stream]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), Stream(arrays=arrays)
 
 
-def _ticks(episode: Episode, start: float, made: Array) -> Stream:
+def _ticks(episode: Episode, start: float, contributions: Array) -> Stream:
     ticks, dim = episode.ticks, episode.layout.dim
     smoothed = np.full((dim, ticks.num_rows), np.nan, np.float32)
-    places, known = _requested_rows(episode)
-    smoothed[:, places[known]] = vectors(episode.smoothed, "smoothed", dim)[:, known]
+    places, recorded = _requested_rows(episode)
+    smoothed[:, places[recorded]] = vectors(episode.smoothed, "smoothed", dim)[:, recorded]
     changed = np.asarray([bool(changes) for changes in ticks.column("changes").to_pylist()], np.uint8)
     refused = ticks.column("refused").to_numpy(zero_copy_only=False).astype(np.uint8)
     return Stream(
@@ -174,7 +174,7 @@ def _ticks(episode: Episode, start: float, made: Array) -> Stream:
             "executed": vectors(ticks, "executed", dim),
             "safety": np.maximum(changed, 2 * refused).astype(np.uint8),
             "chunk": ticks.column("chunk_id").to_numpy().astype(np.int32),
-            "makers": made,
+            "makers": contributions,
         }
     )
 
@@ -207,10 +207,10 @@ def _times_of(episode: Episode, steps: Array) -> Array:
     ticks = episode.ticks
     if not ticks.num_rows:
         return np.zeros(len(steps))
-    known, planned = ticks.column("step").to_numpy(), ticks.column("planned").to_numpy()
+    recorded, planned = ticks.column("step").to_numpy(), ticks.column("planned").to_numpy()
     period = _period(episode)
-    beyond = np.clip(steps - known[-1], 0, None) * period - np.clip(known[0] - steps, 0, None) * period
-    times: Array = np.interp(steps, known, planned) + beyond
+    beyond = np.clip(steps - recorded[-1], 0, None) * period - np.clip(recorded[0] - steps, 0, None) * period
+    times: Array = np.interp(steps, recorded, planned) + beyond
     return times
 
 
@@ -225,8 +225,8 @@ def hold_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
     return _spans([source in HELD for source in sources], fps)
 
 
-def _spans(there: Sequence[bool], fps: float) -> list[list[float]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(there, np.int8), [0]])))
+def _spans(flags: Sequence[bool], fps: float) -> list[list[float]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, np.int8), [0]])))
     return [
         [float(first) / fps, float(end) / fps] for first, end in zip(edges[::2], edges[1::2], strict=True)
     ]
@@ -236,7 +236,9 @@ def _interventions(episode: Episode) -> list[dict[str, Any]]:
     """Return marks of the spans in which a person intervened; [] if a person drove the robot throughout."""
     if "intervention" not in episode.rows.column_names:
         return []
-    spans = _spans([bool(one) for one in episode.rows.column("intervention").to_pylist()], episode.layout.fps)
+    spans = _spans(
+        [bool(flag) for flag in episode.rows.column("intervention").to_pylist()], episode.layout.fps
+    )
     whole = episode.rows.num_rows / episode.layout.fps
     return [
         {"time": begin, "kind": "intervention", "text": f"a person intervenes for {end - begin:.1f} s"}
@@ -258,9 +260,9 @@ def _marks(episode: Episode, start: float, without: Sequence[str]) -> list[dict[
     return marks
 
 
-def _played(at: float, held: Sequence[Sequence[float]]) -> float:
+def _played(at: float, holds: Sequence[Sequence[float]]) -> float:
     """Return the video time at run time `at` [s]: the run's clock stops while the robot is held."""
-    for begin, end in held:
+    for begin, end in holds:
         if begin <= at:
             at += end - begin
     return at
@@ -270,8 +272,8 @@ def _milestones(
     episode: Episode, unscored: bool, scored: Sequence[tuple[float, str]]
 ) -> list[dict[str, Any]]:
     """Return marks of the scored milestones, else those of the ground truth unless hidden."""
-    found = list(scored)
-    if not found and not unscored:
+    labelled = list(scored)
+    if not labelled and not unscored:
         fps = episode.layout.fps
-        found = [(row / fps, name.replace("_", " ")) for name, row in milestones_reached(episode)]
-    return [{"time": time, "kind": "milestone", "text": f"reached: {words}"} for time, words in found]
+        labelled = [(row / fps, name.replace("_", " ")) for name, row in milestones_reached(episode)]
+    return [{"time": time, "kind": "milestone", "text": f"reached: {label}"} for time, label in labelled]

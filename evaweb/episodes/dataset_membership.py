@@ -85,8 +85,8 @@ def _datasets() -> list[Path]:
     removes.
     """
     root = datasets_dir()
-    there = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
-    return sorted(path for path in there if not path.name.startswith("."))
+    folders = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+    return sorted(path for path in folders if not path.name.startswith("."))
 
 
 def _name(folder: Path) -> str:
@@ -95,15 +95,15 @@ def _name(folder: Path) -> str:
 
 def _places(folder: Path) -> list[tuple[UUID, Membership]]:
     """Return the lab's episodes in a dataset; episodes without a uuid, which come from elsewhere, are left out."""
-    told = folder / EVA_EPISODES
+    table = folder / EVA_EPISODES
     if not (folder / INFO).exists():
         return []
     read_info(folder)
-    if not told.exists():
+    if not table.exists():
         return []
     lines: Sequence[Mapping[str, object]] = Catalog.read(folder).eva
-    at = datetime.fromtimestamp(told.stat().st_mtime, UTC)
-    found = []
+    at = datetime.fromtimestamp(table.stat().st_mtime, UTC)
+    places = []
     for line in lines:
         success = line.get("success")
         place = Membership(
@@ -113,8 +113,8 @@ def _places(folder: Path) -> list[tuple[UUID, Membership]]:
             success=success if isinstance(success, bool) else None,
             at=at,
         )
-        found.append((UUID(str(line["uuid"])), place))
-    return found
+        places.append((UUID(str(line["uuid"])), place))
+    return places
 
 
 def _publish_outdated(uuid: UUID, success: bool | None) -> None:

@@ -71,16 +71,19 @@ def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
     """Measure the smoothness of the robot's motion and store it, or the reason why it is unknown; args: uuid."""
     uuid = UUID(work.args["uuid"])
     try:
-        found = smoothness_in(journal_folder(uuid))
+        smoothness = smoothness_in(journal_folder(uuid))
     except RecordingError as error:
-        found = Smoothness(None, None, {}, str(error))
+        smoothness = Smoothness(None, None, {}, str(error))
     Episode.objects.filter(uuid=uuid).update(
-        smoothness=found.measured,
-        smoothness_commanded=found.commanded,
-        smoothness_detail={"arms": {name: dict(arm) for name, arm in found.arms.items()}, "why": found.why},
+        smoothness=smoothness.measured,
+        smoothness_commanded=smoothness.commanded,
+        smoothness_detail={
+            "arms": {name: dict(arm) for name, arm in smoothness.arms.items()},
+            "why": smoothness.why,
+        },
     )
     services.trial_changed(uuid=uuid)
-    return {"smoothness": found.measured, "why": found.why}
+    return {"smoothness": smoothness.measured, "why": smoothness.why}
 
 
 @job_kind("publish")
@@ -92,10 +95,10 @@ def publish_episode(work: JobContext) -> Mapping[str, Any]:
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
     if not folder.exists():
-        why = "there is no folder of it: nothing of its run is on this disk"
+        reason = "there is no folder of it: nothing of its run is on this disk"
         if episode.away_since is not None:
-            why = f"{whereabouts(episode)} It is published when it is."
-        return {"published": False, "why": why}
+            reason = f"{whereabouts(episode)} It is published when it is."
+        return {"published": False, "why": reason}
     try:
         return _published(work, episode, folder)
     except RecordingError:
@@ -112,9 +115,9 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
         raise RecordingError(f"{folder}: outcome.json {changed}")
     if recorded.closed and not recorded.facts["frames"]:
         return {"published": False, "why": "it has no rows: its run ended before the first"}
-    why = never_published({name: recorded.facts.get(name) for name in ("mode", "kind")})
-    if why:
-        return {"published": False, "why": f"it {why}"}
+    reason = never_published({name: recorded.facts.get(name) for name in ("mode", "kind")})
+    if reason:
+        return {"published": False, "why": f"it {reason}"}
     label = latest_label(data_dir(), str(episode.uuid))
     if label is not None and label.discarded:
         return {"published": False, "why": f"it was discarded by {label.by}"}
@@ -126,14 +129,14 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
     work.report_progress(f"into {name}")
     dataset_folder = datasets_dir() / name
     work.hold([dataset_folder.relative_to(data_dir()).as_posix()])
-    with TemporaryDirectory() as beside:
+    with TemporaryDirectory() as scratch:
         placed = publish(
             folder,
             dataset_folder,
             success=success,
             include_interrupted=success is not None,
             version=work.args.get("version"),
-            sides=write_sidecars(episode.uuid, Path(beside)),
+            sides=write_sidecars(episode.uuid, Path(scratch)),
         )
     dataset = str(placed.dataset.relative_to(data_dir()))
     Episode.objects.filter(uuid=episode.uuid).update(

@@ -19,9 +19,9 @@ def filters(sight: Visibility) -> list[Filter]:
         Filter("station", "Station", stations),
         Filter("mode", "Mode", EpisodeMode.choices),
         Filter("status", "Recording", EpisodeStatus.choices),
-        Filter("quality", "Quality", [(key, words) for key, (words, _) in QUALITY.items()]),
-        Filter("review", "Review", [(key, words) for key, (words, _) in REVIEW.items()]),
-        Filter("tag", "Tag", [(words, words) for words in tag_counts(sight=sight)]),
+        Filter("quality", "Quality", [(key, label) for key, (label, _) in QUALITY.items()]),
+        Filter("review", "Review", [(key, label) for key, (label, _) in REVIEW.items()]),
+        Filter("tag", "Tag", [(label, label) for label in tag_counts(sight=sight)]),
     ]
 
 

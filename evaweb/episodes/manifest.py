@@ -48,7 +48,7 @@ def read_recorded_episode(folder: Path) -> RecordedEpisode:
     layout = Layout.from_manifest(manifest)
     if folder.name != layout.uuid:
         raise RecordingError(f"{folder / 'manifest.json'} is of episode {layout.uuid}, not of {folder.name}")
-    told = {
+    fields = {
         "kind": _text(manifest, "kind", 16) or "rollout",
         "mode": _text(manifest, "mode", 16),
         "strategy": _text(manifest, "strategy", 32),
@@ -58,7 +58,7 @@ def read_recorded_episode(folder: Path) -> RecordedEpisode:
         "operator": _text(manifest, "operator", 150),
         "configuration_hash": _text(manifest, "configuration_hash", 64),
     }
-    facts = {name: value for name, value in told.items() if value} | {
+    facts = {name: value for name, value in fields.items() if value} | {
         "cameras": list(layout.cameras),
         "fps": layout.fps,
         "started_at": _time(manifest.get("started_wall")),

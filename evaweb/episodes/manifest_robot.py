@@ -41,9 +41,9 @@ def drawn_robot_for(manifest: Mapping[str, Any]) -> DrawnRobot:
 
     Raises: NotFound if it is not described any more, or its joints differ from the recorded ones.
     """
-    looks = drawn_robot(str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest))
-    _require_same(looks.robot, manifest)
-    return looks
+    drawn = drawn_robot(str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest))
+    _require_same(drawn.robot, manifest)
+    return drawn
 
 
 def robot_for(manifest: Mapping[str, Any]) -> robots.Robot:

@@ -32,9 +32,9 @@ def pose_message(folder: Path, first: int) -> bytes:
 
 def pose_streams(episode: Episode, first: int) -> bytes:
     """Return the message of `pose_message` for an open episode."""
-    looks = drawn_robot_for(episode.manifest)
+    drawn = drawn_robot_for(episode.manifest)
     if not 0 <= first < max(1, episode.frames):
         raise NotFound(_ROW_EPISODE_HAS_ROWS_0(first=first, frames=episode.frames - 1))
     joints = vectors(episode.rows.slice(first, MOST_ROWS), "qpos", episode.layout.dim).T
-    found = looks.poses(np.nan_to_num(joints))
-    return encode({"poses": Stream(body=found)}, first=first, rows=episode.frames, fps=episode.layout.fps)
+    poses = drawn.poses(np.nan_to_num(joints))
+    return encode({"poses": Stream(body=poses)}, first=first, rows=episode.frames, fps=episode.layout.fps)

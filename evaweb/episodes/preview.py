@@ -75,10 +75,10 @@ def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
         _sync(video)
         small = sheet(source, episode.frames, episode.frame_count(camera))
         write_atomic(draft / sheet_name(camera), small)
-    shown = [camera for camera in episode.videos if episode.frame_count(camera)]
-    if shown:
-        middle = min(episode.frames // 2, episode.frame_count(shown[0]) - 1)
-        write_atomic(draft / THUMBNAIL, thumbnail(episode.videos[shown[0]], middle))
+    cameras = [camera for camera in episode.videos if episode.frame_count(camera)]
+    if cameras:
+        middle = min(episode.frames // 2, episode.frame_count(cameras[0]) - 1)
+        write_atomic(draft / THUMBNAIL, thumbnail(episode.videos[cameras[0]], middle))
     sync_folder(draft)
 
 

@@ -19,13 +19,13 @@ def success_of(path: Path) -> bool | None:
     success = None
     for _, line in read_numbered_lines(path):
         try:
-            said = json.loads(line)
+            fields = json.loads(line)
         except (ValueError, RecursionError):  # an invalid line has never counted
             continue
-        if not isinstance(said, dict) or said.get("kind", "score") != "score":
+        if not isinstance(fields, dict) or fields.get("kind", "score") != "score":
             continue
-        if isinstance(said.get("success"), bool):
-            success = said["success"]
+        if isinstance(fields.get("success"), bool):
+            success = fields["success"]
     return success
 
 

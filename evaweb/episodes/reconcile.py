@@ -85,9 +85,9 @@ class Report:
 def reconcile() -> Report:
     """Synchronise the database with every episode and dataset of the data folder."""
     before = set(Episode.objects.values_list("uuid", flat=True))
-    found, problems = _folders()
+    uuids, problems = _folders()
     read = []
-    for uuid in found:
+    for uuid in uuids:
         problem = services.sync_problem(uuid)
         if problem:
             problems.append(problem)
@@ -125,8 +125,8 @@ def _folders() -> tuple[list[UUID], list[str]]:
     root, problems = episodes_dir(), list[str]()
     # Folders with a leading dot are incoming from other computers, or being removed.
     named = (path for path in root.iterdir() if not path.name.startswith(".")) if root.is_dir() else ()
-    there = (path for path in named if path.is_dir())
-    return sorted(_uuids_from_names(there, "", "no episode", problems)), problems
+    visible = (path for path in named if path.is_dir())
+    return sorted(_uuids_from_names(visible, "", "no episode", problems)), problems
 
 
 def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
@@ -134,7 +134,7 @@ def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, proble
 
     Any other name is added to `problems` as "is `otherwise`", because the file would not be found again.
     """
-    found = set()
+    uuids = set()
     for path in sorted(paths):
         try:
             uuid = UUID(path.name.removesuffix(suffix))
@@ -143,8 +143,8 @@ def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, proble
         if uuid is None or path.name != f"{uuid}{suffix}":
             problems.append(f"{path} is {otherwise}: its name is no uuid in lower case with dashes")
         else:
-            found.add(uuid)
-    return found
+            uuids.add(uuid)
+    return uuids
 
 
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:
@@ -169,12 +169,12 @@ def _give(uuids: Iterable[UUID], recorded: Collection[UUID], problems: list[str]
             runs.append(RestorableRun(uuid, uuid in recorded, lines, problems.append))
         except RecordingError as error:
             problems.append(f"run {uuid}: {error}")
-    return sum(_made(restore, kept, problems) for restore in _restorers for kept in runs)
+    return sum(_made(restore, run, problems) for restore in _restorers for run in runs)
 
 
-def _made(restore: Restorer, kept: RestorableRun, problems: list[str]) -> int:
+def _made(restore: Restorer, run: RestorableRun, problems: list[str]) -> int:
     try:
-        return restore(kept)
+        return restore(run)
     except _OF_ONE_RUN as error:
-        problems.append(f"run {kept.uuid}: {error}")
+        problems.append(f"run {run.uuid}: {error}")
         return 0

@@ -72,10 +72,10 @@ class PlaybackStage:
 
 def episode_get(*, uuid: UUID) -> Episode:
     """Return the episode with the related rows of its page. Raises: NotFound."""
-    found = Episode.objects.select_related(*_WITH).filter(uuid=uuid).first()
-    if found is None:
+    episode = Episode.objects.select_related(*_WITH).filter(uuid=uuid).first()
+    if episode is None:
         raise NotFound(_EPISODE_DOES_NOT_EXIST_THIS(uuid=uuid))
-    return found
+    return episode
 
 
 def episode_list(
@@ -96,24 +96,24 @@ def episode_list(
     Raises: EvaError for too many words.
     """
     newest = (F("started_at").desc(nulls_last=True), "-created_at")
-    found = Episode.objects.select_related(*_WITH).prefetch_related("tags").order_by(*newest)
+    rows = Episode.objects.select_related(*_WITH).prefetch_related("tags").order_by(*newest)
     if station:
-        found = found.filter(station__name=station)
+        rows = rows.filter(station__name=station)
     if mode:
-        found = found.filter(mode=mode)
+        rows = rows.filter(mode=mode)
     if status:
-        found = found.filter(status=status)
-    seen = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
+        rows = rows.filter(status=status)
+    visible = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
     if tag:
-        found = found.filter(_by_someone(seen, "tags__by", sight), tags__words=tag)
+        rows = rows.filter(_by_someone(visible, "tags__by", sight), tags__words=tag)
     if review in ("pass", "fail"):
-        found = found.filter(_by_someone(seen, "standing__review__reviewer", sight))
-    found = found.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
+        rows = rows.filter(_by_someone(visible, "standing__review__reviewer", sight))
+    rows = rows.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
     for word in words_of(words):
-        found = found.filter(
+        rows = rows.filter(
             Q(task__icontains=word)
             | (
-                Q(checkpoint__icontains=word) & seen
+                Q(checkpoint__icontains=word) & visible
                 if not sight.hides_nothing
                 else Q(checkpoint__icontains=word)
             )
@@ -122,19 +122,19 @@ def episode_list(
             | Q(trial__scene__title__icontains=word)
             | Q(uuid__icontains=word)
         )
-    return found
+    return rows
 
 
 def tag_counts(*, sight: Visibility = FULL_VISIBILITY) -> dict[str, int]:
     """Return the lab's tags in alphabetical order with the number of episodes of each."""
-    seen = ~Q(episode__checkpoint__in=sight.names) & ~Q(episode__trial__checkpoint__in=sight.checkpoints)
-    rows = Tag.objects.filter(_by_someone(seen, "by", sight)).order_by("words").values_list("words")
-    return {words: n for words, n in rows.annotate(n=Count("pk")) if not sight.named_in(words)}
+    visible = ~Q(episode__checkpoint__in=sight.names) & ~Q(episode__trial__checkpoint__in=sight.checkpoints)
+    rows = Tag.objects.filter(_by_someone(visible, "by", sight)).order_by("words").values_list("words")
+    return {text: n for text, n in rows.annotate(n=Count("pk")) if not sight.named_in(text)}
 
 
-def _by_someone(seen: Q, author: str, sight: Visibility) -> Q:
-    """Return the condition for opinions that this user may see: those on episodes in `seen`, and their own."""
-    return Q() if sight.hides_nothing else seen | Q(**{author: sight.user})
+def _by_someone(visible: Q, author: str, visibility: Visibility) -> Q:
+    """Return the condition for opinions that this user may see: those on episodes in `visible`, and their own."""
+    return Q() if visibility.hides_nothing else visible | Q(**{author: visibility.user})
 
 
 def playback_stage(*, episode: Episode) -> PlaybackStage:

@@ -71,9 +71,9 @@ def record_opened(
 
 def _require_own(station: Station, uuid: UUID) -> None:
     """Raise Conflict for another station's episode: a compromised computer may affect only its own."""
-    other = Episode.objects.exclude(station=station).select_related("station").filter(uuid=uuid).first()
-    if other is not None:
-        raise Conflict(_ANOTHERS(uuid=uuid, owner=other.station.name, station=station.name))
+    foreign = Episode.objects.exclude(station=station).select_related("station").filter(uuid=uuid).first()
+    if foreign is not None:
+        raise Conflict(_ANOTHERS(uuid=uuid, owner=foreign.station.name, station=station.name))
 
 
 def record_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
@@ -134,9 +134,9 @@ def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
     """
     recorded = read_recorded_episode(journal_folder(uuid))
     row = Episode.objects.filter(uuid=uuid, status__in=CLOSED).first()
-    if row is not None and (why := outcome_change(row, recorded.facts.get("seal"))):
+    if row is not None and (reason := outcome_change(row, recorded.facts.get("seal"))):
         Episode.objects.filter(uuid=uuid).update(verified_at=None)
-        raise RecordingError(f"{journal_folder(uuid)}: {OUTCOME} {why}")
+        raise RecordingError(f"{journal_folder(uuid)}: {OUTCOME} {reason}")
     facts = dict(recorded.facts) | {
         "previewed_at": _previewed_at(uuid),
         "damage": marked_damage(data_dir(), str(uuid)),
@@ -195,13 +195,13 @@ def request_smoothness(*, most: int) -> int:
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
     )
-    found = list(rows.filter(away_since=None).order_by("created_at")[:most])
-    for episode in found:
+    episodes = list(rows.filter(away_since=None).order_by("created_at")[:most])
+    for episode in episodes:
         with transaction.atomic():
             # Requested once, whatever its outcome: a failed job remains visible and can be retried.
             Episode.objects.filter(pk=episode.pk).update(smoothness_detail={})
             enqueue(kind="smoothness", key=f"smoothness:{episode.uuid}", args={"uuid": str(episode.uuid)})
-    return len(found)
+    return len(episodes)
 
 
 def request_publish(*, episode: Episode, version: str = "") -> Job | None:
@@ -228,11 +228,11 @@ def close_unheard_episodes() -> int:
 def mark_missing() -> int:
     """Mark every row without a folder as missing; return the number of all missing episodes."""
     fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
-    known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
+    expected = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
     # A recording on another computer is there until it is closed, and then in transfer.
     elsewhere = StationKey.objects.filter(withdrawn_at=None).values("station")
-    known = known.exclude(status=EpisodeStatus.RECORDING, station__in=elsewhere)
-    for uuid in known.values_list("uuid", flat=True):
+    expected = expected.exclude(status=EpisodeStatus.RECORDING, station__in=elsewhere)
+    for uuid in expected.values_list("uuid", flat=True):
         if not journal_folder(uuid).is_dir():
             Episode.objects.filter(uuid=uuid).update(status=EpisodeStatus.MISSING)
     return Episode.objects.filter(status=EpisodeStatus.MISSING).count()
@@ -240,7 +240,7 @@ def mark_missing() -> int:
 
 def request_exports(*, uuids: Iterable[UUID]) -> int:
     """Queue the export of episodes without a table; return their number. Damaged ones are skipped."""
-    asked = 0
+    count = 0
     for episode in Episode.objects.filter(uuid__in=list(uuids), status__in=CLOSED):
         try:
             missing = exported(episode.uuid) is None
@@ -249,8 +249,8 @@ def request_exports(*, uuids: Iterable[UUID]) -> int:
             continue
         if missing:
             request_export(episode=episode)
-            asked += 1
-    return asked
+            count += 1
+    return count
 
 
 def sync_problem(uuid: UUID) -> str:
@@ -288,10 +288,10 @@ def get_or_create_station(
 
     `source` names where these values are from, for the log.
     """
-    station, made = Station.objects.get_or_create(
+    station, created = Station.objects.get_or_create(
         name=name, defaults={"robot": robot, "simulated": simulated, "title": name, "active": active}
     )
-    if made and active:
+    if created and active:
         log.warning("station %s was not in the database: made from %s", name, source)
     return station
 
@@ -301,8 +301,8 @@ def station_elsewhere(station: Station) -> bool:
     return StationKey.objects.filter(station=station, withdrawn_at=None).exists()
 
 
-def _uuid(given: object) -> UUID:
+def _uuid(value: object) -> UUID:
     try:
-        return given if isinstance(given, UUID) else UUID(str(given))
+        return value if isinstance(value, UUID) else UUID(str(value))
     except ValueError:
-        raise EvaError(_NO_EPISODE_EXPECTED_UUID(given=given)) from None
+        raise EvaError(_NO_EPISODE_EXPECTED_UUID(given=value)) from None

@@ -43,7 +43,7 @@ def sheet(video: Path, frames: int, shown: int) -> bytes:
     grid = Grid.of(frames)
     with VideoFrames(video) as pictures:
         height = max(1, round(pictures.size[0] * WIDTH / pictures.size[1]))
-        made = np.zeros((grid.down * height, grid.across * WIDTH, 3), np.uint8)
+        canvas = np.zeros((grid.down * height, grid.across * WIDTH, 3), np.uint8)
         for tile, first in enumerate(range(0, shown, grid.every)):
             row, column = divmod(tile, grid.across)
             try:
@@ -51,6 +51,6 @@ def sheet(video: Path, frames: int, shown: int) -> bytes:
             except RecordingError:
                 continue
             small = np.asarray(picture.resize((WIDTH, height), Image.Resampling.BILINEAR, reducing_gap=2.0))
-            made[row * height : (row + 1) * height, column * WIDTH : (column + 1) * WIDTH] = small
-    jpeg: bytes = simplejpeg.encode_jpeg(made, quality=QUALITY)
+            canvas[row * height : (row + 1) * height, column * WIDTH : (column + 1) * WIDTH] = small
+    jpeg: bytes = simplejpeg.encode_jpeg(canvas, quality=QUALITY)
     return jpeg

@@ -66,8 +66,8 @@ def smoothness_of(episode: Episode) -> Smoothness:
         )
     forward = ChainForward(robot)
     measured = _tip_track(_measured(episode), float(rate), forward)
-    seen = measured.seen
-    if seen is not None and seen < _LEAST_RATE:
+    observed_rate = measured.seen
+    if observed_rate is not None and observed_rate < _LEAST_RATE:
         measured = replace(measured, spans=())
     arms: dict[str, dict[str, float | None]] = {arm.name: {} for arm in robot.arms}
     for stream, track in (
@@ -75,24 +75,25 @@ def smoothness_of(episode: Episode) -> Smoothness:
         ("commanded", _tip_track(_commanded(episode, rate), float(rate), forward)),
     ):
         for index, arm in enumerate(robot.arms):
-            way = _path_lengths(track.spans, index)
-            arms[arm.name] |= {stream: _sparc(way, float(rate)), f"{stream}_m": float(way.sum())}
+            path = _path_lengths(track.spans, index)
+            arms[arm.name] |= {stream: _sparc(path, float(rate)), f"{stream}_m": float(path.sum())}
     moved = {
         name: facts for name, facts in arms.items() if any(facts[stream] is not None for stream in _STREAMS)
     }
-    found = Smoothness(_mean(moved, "measured"), _mean(moved, "commanded"), moved)
-    if found.measured is not None:
-        return found
-    if seen is not None and seen < _LEAST_RATE:
+    result = Smoothness(_mean(moved, "measured"), _mean(moved, "commanded"), moved)
+    if result.measured is not None:
+        return result
+    if observed_rate is not None and observed_rate < _LEAST_RATE:
         return replace(
-            found,
-            why=f"{seen:.0f} observations a second: SPARC looks at up to {CUT_OFF:g} Hz, which takes twice that",
+            result,
+            why=f"{observed_rate:.0f} observations a second: SPARC looks at up to {CUT_OFF:g} Hz, "
+            "which takes twice that",
         )
-    return replace(found, why=f"no arm moved farther than {LEAST_M * 1000:.0f} mm while it was asked to")
+    return replace(result, why=f"no arm moved farther than {LEAST_M * 1000:.0f} mm while it was asked to")
 
 
-def _none(why: str) -> Smoothness:
-    return Smoothness(None, None, {}, why)
+def _none(reason: str) -> Smoothness:
+    return Smoothness(None, None, {}, reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +120,8 @@ def _measured(episode: Episode) -> _Samples:
     """Return the joints measured by the robot at their capture times; a tick has the newest sample of any age."""
     rows, name = episode.rows, "capture_time.joints"
     ticked = rows.column("tick_time").to_numpy()
-    told = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked
-    times = np.asarray(told if np.isfinite(told.astype(float)).any() else ticked, np.float64)
+    captured = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked
+    times = np.asarray(captured if np.isfinite(captured.astype(float)).any() else ticked, np.float64)
     joints = vectors(rows, "qpos", episode.layout.dim).T.astype(np.float64)
     joints[np.diff(rows.column("sequence").to_numpy(), prepend=-1) == 0] = np.nan  # repeated sample
     return _Samples(times, joints, _asked(rows))
@@ -138,18 +139,18 @@ def _asked(table: Any) -> NDArray[np.bool_]:
 
 
 def _tip_track(samples: _Samples, rate: float, forward: ChainForward) -> _TipTrack:
-    known = np.isfinite(samples.joints).all(axis=1) & np.isfinite(samples.times)
+    valid = np.isfinite(samples.joints).all(axis=1) & np.isfinite(samples.times)
     spans, count, duration = [], 0, 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], samples.asked.astype(np.int8), [0]])))
     for first, end in zip(edges[::2], edges[1::2], strict=True):
-        there = first + np.flatnonzero(known[first:end])
-        at = samples.times[there]
+        indices = first + np.flatnonzero(valid[first:end])
+        at = samples.times[indices]
         later = at > np.concatenate([[-np.inf], np.maximum.accumulate(at)[:-1]])
-        there, at = there[later], at[later]
-        if len(there) < 2:
+        indices, at = indices[later], at[later]
+        if len(indices) < 2:
             continue
-        count, duration = count + len(there) - 1, duration + float(at[-1] - at[0])
-        places = forward.forward(samples.joints[there])[..., :3]
+        count, duration = count + len(indices) - 1, duration + float(at[-1] - at[0])
+        places = forward.forward(samples.joints[indices])[..., :3]
         grid = at[0] + np.arange(int((at[-1] - at[0]) * rate + 1e-6) + 1) / rate
         every = [np.interp(grid, at, places[:, a, x]) for a in range(places.shape[1]) for x in range(3)]
         spans.append(np.stack(every, axis=-1).reshape(len(grid), places.shape[1], 3))
@@ -166,14 +167,18 @@ def _path_lengths(spans: Sequence[Array], arm: int) -> Array:
     return np.concatenate([np.linalg.norm(np.diff(span[:, arm], axis=0), axis=1) for span in spans])
 
 
-def _sparc(way: Array, rate: float) -> float | None:
+def _sparc(path: Array, rate: float) -> float | None:
     try:
-        return sparc(way.tolist(), rate)
+        return sparc(path.tolist(), rate)
     except StatisticsError:  # no motion, or too short
         return None
 
 
 def _mean(arms: Mapping[str, Mapping[str, float | None]], stream: str) -> float | None:
     rows = [(facts[stream], facts[f"{stream}_m"] or 0.0) for facts in arms.values()]
-    known = [(value, way) for value, way in rows if value is not None]
-    return sum(value * way for value, way in known) / sum(way for _, way in known) if known else None
+    valued = [(value, length) for value, length in rows if value is not None]
+    return (
+        sum(value * length for value, length in valued) / sum(length for _, length in valued)
+        if valued
+        else None
+    )

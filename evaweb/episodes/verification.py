@@ -89,10 +89,10 @@ def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
     """Return the result of a verification; damaged if a closed recording has no outcome any more, or another one."""
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
-    why = outcome_change(row, None if verdict.state == "open" else verdict.seal)
-    if not why:
+    reason = outcome_change(row, None if verdict.state == "open" else verdict.seal)
+    if not reason:
         return verdict
-    return replace(verdict, state="damaged", damage=(Damage(OUTCOME, why),), seal=row.seal)
+    return replace(verdict, state="damaged", damage=(Damage(OUTCOME, reason),), seal=row.seal)
 
 
 def _verify_folder(folder: Path) -> IntegrityCheck:

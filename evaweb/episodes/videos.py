@@ -48,41 +48,41 @@ def put_videos(uuid: UUID) -> int:
     """
     store = required_store()
     videos = sorted(preview_folder(uuid).glob("*.mp4"))
-    found = {path.stem: store.put(path, TYPE) for path in videos}
-    if not found:
+    digests = {path.stem: store.put(path, TYPE) for path in videos}
+    if not digests:
         return 0
-    for digest in found.values():
+    for digest in digests.values():
         compared(store, digest)
-    told = json.dumps(_stored(uuid) | found, indent=1, ensure_ascii=False)
-    write_atomic(preview_folder(uuid) / INDEX, told.encode())
+    text = json.dumps(_stored(uuid) | digests, indent=1, ensure_ascii=False)
+    write_atomic(preview_folder(uuid) / INDEX, text.encode())
     for path in videos:
         path.unlink(missing_ok=True)
-    return len(found)
+    return len(digests)
 
 
 def unstored() -> list[UUID]:
     """Return the previews with videos that are not in the store; [] without a store."""
     if the_store() is None:
         return []
-    found = []
+    uuids = []
     for path in sorted((data_dir() / "previews").glob("*/*.mp4")):
         try:
             uuid = UUID(path.parent.name)
         except ValueError:
             continue
-        if uuid not in found[-1:]:
-            found.append(uuid)
-    return found
+        if uuid not in uuids[-1:]:
+            uuids.append(uuid)
+    return uuids
 
 
 def _stored(uuid: UUID) -> dict[str, str]:
     path = preview_folder(uuid) / INDEX
     try:
-        told = json.loads(path.read_bytes())
+        digests = json.loads(path.read_bytes())
     except FileNotFoundError:
         return {}
     except ValueError:
-        told = None
-    if not isinstance(told, dict) or not all(isinstance(digest, str) for digest in told.values()):
+        digests = None
+    if not isinstance(digests, dict) or not all(isinstance(digest, str) for digest in digests.values()):
         raise StoreError(_NO_INDEX(path=path))
-    return told
+    return digests

@@ -62,19 +62,19 @@ PER_PAGE = 50
 @require_GET
 def replay_list(request: HttpRequest) -> HttpResponseBase:
     """Show all episodes, by default newest first."""
-    sight = visibility_for_request(request)
-    listing = Listing(request.GET, listed.columns(sight), listed.filters(sight))
-    found = selectors.episode_list(**listing.chosen, sight=sight)
+    visibility = visibility_for_request(request)
+    listing = Listing(request.GET, listed.columns(visibility), listed.filters(visibility))
+    episodes = selectors.episode_list(**listing.chosen, sight=visibility)
     if listing.wants_file:
-        return listing.file(request, "episodes", found)
-    page = listing.page(found, PER_PAGE)
+        return listing.file(request, "episodes", episodes)
+    page = listing.page(episodes, PER_PAGE)
     rows = [(episode, selectors.playback_stage(episode=episode)) for episode in page]
     context = {
         "listing": listing,
         "page": page,
         "rows": rows,
         "may_review": role_of(request.user) is not Role.VIEWER,
-        "tags": selectors.tag_counts(sight=sight),
+        "tags": selectors.tag_counts(sight=visibility),
         "passing": any(stage.is_transient for _, stage in rows),
     }
     htmx: Any = request.htmx  # type: ignore[attr-defined]
@@ -103,9 +103,9 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
 def playback_stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Show the stage of an episode; make the page reload when it is ready."""
     episode = episode_get(uuid=uuid)
-    found = selectors.playback_stage(episode=episode)
-    answer = render(request, "episodes/stage.html", {"episode": episode, "stage": found})
-    if found.name == "ready":
+    stage = selectors.playback_stage(episode=episode)
+    answer = render(request, "episodes/stage.html", {"episode": episode, "stage": stage})
+    if stage.name == "ready":
         answer["HX-Refresh"] = "true"
     return answer
 
@@ -210,13 +210,13 @@ async def _known_camera(uuid: UUID, camera: str) -> None:
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Return joint curves and events as one message of evaweb.core.binary_frames."""
-    episode, sight = episode_get(uuid=uuid), visibility_for_request(request)
-    told = {
-        "covered": sight.hides_episode(episode),
-        "unscored": selectors.unscored_for(episode=episode, sight=sight),
+    episode, visibility = episode_get(uuid=uuid), visibility_for_request(request)
+    options = {
+        "covered": visibility.hides_episode(episode),
+        "unscored": selectors.unscored_for(episode=episode, sight=visibility),
         "milestones": selectors.milestones_of(episode=episode),
     }
-    return _binary_response(lambda: curve_message(journal_folder(uuid), **told))
+    return _binary_response(lambda: curve_message(journal_folder(uuid), **options))
 
 
 @require_GET

@@ -54,8 +54,8 @@ _PAGES = (
 
 def pages_of(role: Role) -> list[tuple[Page, str]]:
     """Return the pages that the role may open, with their addresses."""
-    found = [(page, _address(page.route)) for page in _PAGES if role.includes(page.least)]
-    return [(page, address) for page, address in found if address]
+    pages = [(page, _address(page.route)) for page in _PAGES if role.includes(page.least)]
+    return [(page, address) for page, address in pages if address]
 
 
 def _address(route: str) -> str:

@@ -27,13 +27,17 @@ def rank(query: str, name: str, more: str = "") -> Rank | None:
 
     `more` are further searchable words.
     """
-    wanted, called, text = " ".join(query.casefold().split()), name.casefold(), f"{name} {more}".casefold()
-    if wanted == called:
+    sought, called, text = " ".join(query.casefold().split()), name.casefold(), f"{name} {more}".casefold()
+    if sought == called:
         return Rank.EXACT
-    if called.startswith(wanted):
+    if called.startswith(sought):
         return Rank.PREFIX
-    words = words_of(query)
-    if not all(word in text for word in words):
+    parts = words_of(query)
+    if not all(word in text for word in parts):
         return None
-    begun = [found[0] for found in _WORD.finditer(text)] + text.split()
-    return Rank.WORD if all(any(one.startswith(word) for one in begun) for word in words) else Rank.INSIDE
+    begun = [match[0] for match in _WORD.finditer(text)] + text.split()
+    return (
+        Rank.WORD
+        if all(any(beginning.startswith(word) for beginning in begun) for word in parts)
+        else Rank.INSIDE
+    )

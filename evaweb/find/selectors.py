@@ -85,8 +85,8 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
         "Pages": lambda: _ranked(query, _pages(role)),
     }
     groups = []
-    for name, look in kinds.items():
-        items = list(look())
+    for name, search in kinds.items():
+        items = list(search())
         if items:
             groups.append(Group(name, tuple(items[:MOST]), len(items) > MOST))
     return groups
@@ -94,9 +94,9 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
 
 def _ranked(query: str, candidates: Iterable[Candidate]) -> list[FoundItem]:
     """Return the matching items, best first; items of equal rank keep the given order."""
-    fits = [(rank(query, found.title, more), found) for found, more in candidates]
-    known = [(fit, found) for fit, found in fits if fit is not None]
-    return [found for _, found in sorted(known, key=lambda one: one[0])]
+    fits = [(rank(query, item.title, more), item) for item, more in candidates]
+    ranked = [(fit, item) for fit, item in fits if fit is not None]
+    return [item for _, item in sorted(ranked, key=lambda one: one[0])]
 
 
 def _narrowed(rows: QuerySet[Any], query: str, *fields: str) -> QuerySet[Any]:
@@ -116,10 +116,10 @@ def _narrowed(rows: QuerySet[Any], query: str, *fields: str) -> QuerySet[Any]:
 
 
 def _any_of(fields: Iterable[str], lookup: str, value: str) -> Q:
-    found = Q()
+    condition = Q()
     for field in fields:
-        found |= Q(**{f"{field}__{lookup}": value})
-    return found
+        condition |= Q(**{f"{field}__{lookup}": value})
+    return condition
 
 
 # --- kinds with few rows -------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ def _any_of(fields: Iterable[str], lookup: str, value: str) -> Q:
 
 def _stations(query: str) -> Iterator[Candidate]:
     """Yield each station with its Eval page, and its other pages if the query names them."""
-    words = words_of(query)
+    parts = words_of(query)
     for station in Station.objects.order_by("-active", "name"):
         detail = " · ".join((station.name, station.robot, *(() if station.active else ("switched off",))))
         pages = {"Debug": "station-debug", **({"Collect": "station-collect"} if station.collects else {})}
@@ -136,9 +136,9 @@ def _stations(query: str) -> Iterator[Candidate]:
             f"{detail} station eval",
         )
         for page, route in pages.items():
-            if any(len(word) > 1 and page.casefold().startswith(word) for word in words):
-                found = FoundItem(f"{station} · {page}", detail, reverse(route, args=[station.name]))
-                yield found, f"{detail} station"
+            if any(len(word) > 1 and page.casefold().startswith(word) for word in parts):
+                item = FoundItem(f"{station} · {page}", detail, reverse(route, args=[station.name]))
+                yield item, f"{detail} station"
 
 
 def _plans(query: str, user: Any) -> Iterator[Candidate]:
@@ -156,8 +156,8 @@ def _plans(query: str, user: Any) -> Iterator[Candidate]:
         )
 
 
-def _checkpoints(query: str, role: Role, sight: Visibility) -> Iterator[Candidate]:
-    rows = checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None).only("name", "active")
+def _checkpoints(query: str, role: Role, visibility: Visibility) -> Iterator[Candidate]:
+    rows = checkpoint_list(all_of_them=True, sight=visibility).prefetch_related(None).only("name", "active")
     for row in _narrowed(rows, _without(query, "checkpoint"), "name"):
         detail = "" if row.active else "not offered"
         yield FoundItem(row.name, detail, _administered("checkpoint", row.pk, row.name, role)), "checkpoint"
@@ -177,11 +177,11 @@ def _administered(kind: str, key: int, name: str, role: Role) -> str:
     return f"{reverse('replay-list')}?{urlencode({'words': name})}"
 
 
-def _tags(sight: Visibility) -> Iterator[Candidate]:
+def _tags(visibility: Visibility) -> Iterator[Candidate]:
     """Yield the tags, each with the address of its episodes."""
-    for words, n in tag_counts(sight=sight).items():
+    for tag, n in tag_counts(sight=visibility).items():
         detail = f"{n} episode{'' if n == 1 else 's'}"
-        yield FoundItem(words, detail, f"{reverse('replay-list')}?{urlencode({'tag': words})}"), "tag tagged"
+        yield FoundItem(tag, detail, f"{reverse('replay-list')}?{urlencode({'tag': tag})}"), "tag tagged"
 
 
 def _datasets() -> Iterator[Candidate]:
@@ -209,21 +209,21 @@ def _trials(query: str) -> list[FoundItem]:
 
     In both groups exact matches come first.
     """
-    asked = _without(query, "trial").removeprefix("#")
+    text = _without(query, "trial").removeprefix("#")
     rows = Trial.objects.select_related("scene", "position", "station", "handout")
-    found: dict[int, Trial] = {}
-    if re.fullmatch(rf"[1-9][0-9]{{0,{_DIGITS - 1}}}", asked, re.ASCII):
-        for first, last in _numbers(asked):
-            if len(found) <= MOST:
+    by_pk: dict[int, Trial] = {}
+    if re.fullmatch(rf"[1-9][0-9]{{0,{_DIGITS - 1}}}", text, re.ASCII):
+        for first, last in _numbers(text):
+            if len(by_pk) <= MOST:
                 near = rows.filter(pk__range=(first, last)).order_by("pk")[: MOST + 1]
-                found |= {trial.pk: trial for trial in near}
-    if _CODE.fullmatch(asked) and len(found) <= MOST:
-        code = asked.upper()
+                by_pk |= {trial.pk: trial for trial in near}
+    if _CODE.fullmatch(text) and len(by_pk) <= MOST:
+        code = text.upper()
         coded = Handout.objects.filter(code__gte=code, code__lte=f"{code}{'Z' * 8}").order_by("code", "-pk")
-        wanted = list(coded.values_list("trial", flat=True)[: MOST + 1])
-        by_key = rows.in_bulk(wanted)
-        found |= {key: by_key[key] for key in wanted}
-    return [_trial(trial) for trial in list(found.values())[: MOST + 1]]
+        keys = list(coded.values_list("trial", flat=True)[: MOST + 1])
+        by_key = rows.in_bulk(keys)
+        by_pk |= {key: by_key[key] for key in keys}
+    return [_trial(trial) for trial in list(by_pk.values())[: MOST + 1]]
 
 
 def _numbers(digits: str) -> Iterator[tuple[int, int]]:
@@ -241,10 +241,10 @@ def _trial(trial: Trial) -> FoundItem:
 
 def _episodes(query: str) -> list[FoundItem]:
     """Return the episodes by a prefix of their uuid, of at least four characters."""
-    asked = _without(query, "episode").casefold().replace("-", "")
-    if not _UUID.fullmatch(asked):
+    text = _without(query, "episode").casefold().replace("-", "")
+    if not _UUID.fullmatch(text):
         return []
-    first, last = UUID(asked.ljust(32, "0")), UUID(asked.ljust(32, "f"))
+    first, last = UUID(text.ljust(32, "0")), UUID(text.ljust(32, "f"))
     rows = Episode.objects.select_related("station").filter(uuid__range=(first, last)).order_by("uuid")
     return [_episode(episode) for episode in rows[: MOST + 1]]
 

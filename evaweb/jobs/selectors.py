@@ -46,10 +46,10 @@ def job_newest(*, key: str) -> Job | None:
 
 def job_get(*, id: int) -> Job:
     """Return the job with that id. Raises: NotFound."""
-    found = Job.objects.filter(pk=id).first()
-    if found is None:
+    job = Job.objects.filter(pk=id).first()
+    if job is None:
         raise NotFound(_JOB_DOES_NOT_EXIST_THIS(identity=id))
-    return found
+    return job
 
 
 # --- how far they are ----------------------------------------------------------------------------------------
@@ -109,8 +109,10 @@ def pace_of(job: Job, now: datetime | None = None) -> Pace:
     took = max(0.0, ((now or timezone.now()) - job.claimed_at).total_seconds())
     steps = _STEPS.search(job.progress)
     if steps and 0 < int(steps[1]) <= int(steps[2]):
-        done, all_of_them = int(steps[1]) - 1, int(steps[2])  # step n itself is still running
-        return Pace(done / all_of_them, took / done * (all_of_them - done) if done else None)
+        completed, all_of_them = int(steps[1]) - 1, int(steps[2])  # step n itself is still running
+        return Pace(
+            completed / all_of_them, took / completed * (all_of_them - completed) if completed else None
+        )
     usual = _usual_s(job.kind)
     return Pace(min(1.0, took / usual), max(0.0, usual - took)) if usual and took <= usual else Pace()
 

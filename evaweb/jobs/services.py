@@ -73,11 +73,11 @@ def enqueue(*, kind: str, key: str, args: Args) -> Job:
 
 def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
     for _ in range(3):
-        asked = Job.objects.filter(key=key, status=JobStatus.QUEUED)
-        if asked.update(kind=kind, args=dict(args), queue=queue, not_before=None, attempts=0, deaths=0):
-            found = asked.first()
-            if found is not None:
-                return found
+        queued = Job.objects.filter(key=key, status=JobStatus.QUEUED)
+        if queued.update(kind=kind, args=dict(args), queue=queue, not_before=None, attempts=0, deaths=0):
+            job = queued.first()
+            if job is not None:
+                return job
         try:
             with transaction.atomic():
                 return Job.objects.create(kind=kind, key=key, args=dict(args), queue=queue)
@@ -101,11 +101,11 @@ def cancel(*, user: Any, job: Job) -> Job:
     row = Job.objects.filter(pk=job.pk)
     waiting = row.filter(status=JobStatus.QUEUED)
     ended = {"status": JobStatus.FAILED, "finished_at": Now(), "error": _cancelled_words(user)}
-    asked = waiting.update(cancelled_by=user, **ended) or row.filter(status=JobStatus.RUNNING).update(
+    updated = waiting.update(cancelled_by=user, **ended) or row.filter(status=JobStatus.RUNNING).update(
         cancelled_by=user
     )
     job.refresh_from_db()
-    if not asked:
+    if not updated:
         raise Conflict(_JOB_THERE_NOTHING_CANCEL(job=job.pk, key=job.key, status=job.get_status_display()))
     log.info("job %s is cancelled by %s", job.key, user.get_username())
     return job
@@ -121,8 +121,8 @@ def _cancelled_words(user: Any) -> str:
 def claim(*, queue: str, owner: UUID) -> Job | None:
     """Claim the oldest ready job that this process can do; None if there is none. Of two workers only one gets it."""
     folder = has_lab_folder()
-    while (found := jobs_ready(queues=[queue], folder=folder).first()) is not None:
-        taken = Job.objects.filter(pk=found.pk, status=JobStatus.QUEUED).update(
+    while (ready := jobs_ready(queues=[queue], folder=folder).first()) is not None:
+        claimed = Job.objects.filter(pk=ready.pk, status=JobStatus.QUEUED).update(
             status=JobStatus.RUNNING,
             owner=owner,
             claimed_at=Now(),
@@ -130,8 +130,8 @@ def claim(*, queue: str, owner: UUID) -> Job | None:
             finished_at=None,
             progress="",
         )
-        if taken:
-            return Job.objects.get(pk=found.pk)
+        if claimed:
+            return Job.objects.get(pk=ready.pk)
     return None
 
 
@@ -140,11 +140,11 @@ def run_queue(queue: str) -> int:
     if not _busy.acquire(blocking=False):
         return 0
     try:
-        done = 0
+        count = 0
         while not _ending.is_set() and (job := retry_while_locked(partial(claim, queue=queue, owner=OWNER))):
             _perform(job)
-            done += 1
-        return done
+            count += 1
+        return count
     finally:
         _busy.release()
 
@@ -208,18 +208,18 @@ def _acquire_names(job: Job, names: Sequence[str]) -> str | None:
             Hold.objects.filter(what__in=names).exclude(pk__in=at_work.values("pk")).delete()
             Hold.objects.bulk_create(Hold(what=name, job=job, owner=job.owner) for name in names)
     except IntegrityError:
-        other = at_work.filter(what__in=names).exclude(job=job).values_list("job__key", flat=True).first()
-        return other or "which has just ended"
+        key = at_work.filter(what__in=names).exclude(job=job).values_list("job__key", flat=True).first()
+        return key or "which has just ended"
     return None
 
 
 def _tell(job: Job, progress: str) -> None:
-    ours = _ours(job)
+    own = _ours(job)
     if retry_while_locked(
-        lambda: ours.filter(cancelled_by=None).update(progress=progress[:160], seen_at=Now())
+        lambda: own.filter(cancelled_by=None).update(progress=progress[:160], seen_at=Now())
     ):
         return
-    if retry_while_locked(ours.exists):
+    if retry_while_locked(own.exists):
         raise Cancelled
     raise JobTakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
 
@@ -231,10 +231,10 @@ def heartbeat(*, job: Job) -> bool:
 
 def job_done(*, job: Job, result: Args) -> bool:
     """Record the result; return False if the job was reclaimed meanwhile, and its new owner records the outcome."""
-    done = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
-    if done:
+    finished = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
+    if finished:
         log.info("job %s is done: %s", job.key, dict(result))
-    return done
+    return finished
 
 
 def job_failed(*, job: Job, error: str) -> bool:
@@ -242,15 +242,15 @@ def job_failed(*, job: Job, error: str) -> bool:
     attempts = job.attempts + 1
     if attempts >= MOST_ATTEMPTS:
         return _finish(job, status=JobStatus.FAILED, attempts=attempts, error=error)
-    again = Now() + timedelta(seconds=RETRY_AFTER_S[attempts - 1])
-    return _requeue_row(_ours(job), attempts=attempts, error=error, not_before=again)
+    not_before = Now() + timedelta(seconds=RETRY_AFTER_S[attempts - 1])
+    return _requeue_row(_ours(job), attempts=attempts, error=error, not_before=not_before)
 
 
 def job_postponed(*, job: Job) -> bool:
     """Queue the job again after a few seconds: the process that had it before has not ended yet."""
-    why = "the worker that had it before is still at it: it is waited for; end that one if it hangs"
-    log.warning("job %s: %s", job.key, why)
-    return _requeue_row(_ours(job), progress=why, not_before=Now() + timedelta(seconds=_AGAIN_S))
+    reason = "the worker that had it before is still at it: it is waited for; end that one if it hangs"
+    log.warning("job %s: %s", job.key, reason)
+    return _requeue_row(_ours(job), progress=reason, not_before=Now() + timedelta(seconds=_AGAIN_S))
 
 
 def _finish(job: Job, **facts: Any) -> bool:
@@ -270,8 +270,8 @@ def _ended_if_cancelled(row: QuerySet[Job]) -> bool:
     by = row.exclude(cancelled_by=None).select_related("cancelled_by").first()
     if by is None:
         return False
-    words = _cancelled_words(by.cancelled_by)
-    return bool(row.update(status=JobStatus.FAILED, owner=None, finished_at=Now(), error=words))
+    text = _cancelled_words(by.cancelled_by)
+    return bool(row.update(status=JobStatus.FAILED, owner=None, finished_at=Now(), error=text))
 
 
 def _requeue_row(row: QuerySet[Job], **facts: Any) -> bool:
@@ -312,8 +312,8 @@ def _reclaim(job: Job) -> bool:
     log.warning("job %s is taken back: %s", job.key, silence)
     wait = (0.0, *RETRY_AFTER_S)[min(deaths - 1, len(RETRY_AFTER_S))]  # lets other jobs run meanwhile
     # None is ready immediately, Now() only after this instant.
-    again = Now() + timedelta(seconds=wait) if wait else None
-    return _requeue_row(row, deaths=deaths, error=silence, not_before=again)
+    not_before = Now() + timedelta(seconds=wait) if wait else None
+    return _requeue_row(row, deaths=deaths, error=silence, not_before=not_before)
 
 
 def requeue(*, owner: UUID) -> int:

@@ -37,11 +37,11 @@ def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
         threading.Thread(target=_watch_input, name="lifeline", daemon=True).start()
     looking = threading.Thread(target=_poll, args=(queues, ending), name="looking")
     looking.start()
-    there = Heartbeat(
+    heartbeat = Heartbeat(
         partial(workers.record_heartbeat, owner=services.OWNER, queues=queues), settings.EVA_JOB_STALE_S / 6
     )
     log.info("worker %s works on %s in %s", services.OWNER, ", ".join(queues), settings.DATA_DIR)
-    with there:
+    with heartbeat:
         while not ending.is_set():
             _answer_doorbell(queues)
             if not ending.is_set():

@@ -63,16 +63,16 @@ def lab_folder_named() -> None:
     if connection.vendor == "sqlite":
         return
     host = socket.gethostname()
-    ours = {"lab_id": settings.EVA_LAB_ID, "host": host, "path": str(settings.DATA_DIR)}
-    found, made = LabFolder.objects.select_for_update().get_or_create(pk=1, defaults=ours)
-    if made or found.lab_id == settings.EVA_LAB_ID:
+    fields = {"lab_id": settings.EVA_LAB_ID, "host": host, "path": str(settings.DATA_DIR)}
+    row, created = LabFolder.objects.select_for_update().get_or_create(pk=1, defaults=fields)
+    if created or row.lab_id == settings.EVA_LAB_ID:
         return
     if _running().filter(folder=True).exists():
-        raise EvaError(_ANOTHER_FOLDER(theirs=found.path, host=found.host, ours=ours["path"]))
+        raise EvaError(_ANOTHER_FOLDER(theirs=row.path, host=row.host, ours=fields["path"]))
     log.warning(
-        "the data folder of the lab was %s of %s; it is %s of %s", found.path, found.host, ours["path"], host
+        "the data folder of the lab was %s of %s; it is %s of %s", row.path, row.host, fields["path"], host
     )
-    LabFolder.objects.filter(pk=1).update(**ours)
+    LabFolder.objects.filter(pk=1).update(**fields)
 
 
 # --- workers -------------------------------------------------------------------------------------------------
@@ -80,13 +80,13 @@ def lab_folder_named() -> None:
 
 def record_heartbeat(*, owner: UUID, queues: Sequence[str]) -> bool:
     """Record a heartbeat of the worker, which also registers a new worker; always return True."""
-    told = {
+    fields = {
         "host": socket.gethostname(),
         "queues": list(queues),
         "folder": has_lab_folder(),
         "seen_at": Now(),
     }
-    WorkerProcess.objects.update_or_create(pk=owner, defaults=told)
+    WorkerProcess.objects.update_or_create(pk=owner, defaults=fields)
     return True
 
 
@@ -143,7 +143,7 @@ def waiting_for(job: Job) -> str:
 
 def queue_names(given: str) -> list[str]:
     """Return the distinct queues of an option. Raises: EvaError, which lists the allowed ones."""
-    asked = {name.strip() for name in given.split(",") if name.strip()}
-    if not asked or not asked <= set(Queue):
+    requested = {name.strip() for name in given.split(",") if name.strip()}
+    if not requested or not requested <= set(Queue):
         raise EvaError(f"--queues {given!r:.120}: allowed: {', '.join(Queue)}, with commas between them")
-    return [queue.value for queue in Queue if queue in asked]
+    return [queue.value for queue in Queue if queue in requested]

@@ -81,7 +81,7 @@ _POSITIONS = (
 @transaction.atomic
 def demo_scene() -> Scene:
     """Return the tabletop scene, created once; changes by an administrator are kept."""
-    scene, made = Scene.objects.get_or_create(
+    scene, created = Scene.objects.get_or_create(
         name="block-on-plate",
         defaults={
             "title": "Block on plate",
@@ -91,7 +91,7 @@ def demo_scene() -> Scene:
             "time_limit_s": 40.0,
         },
     )
-    if made:
+    if created:
         for number, (label, block, plate) in enumerate(_POSITIONS, start=1):
             bench = {"block": block, "plate": plate}
             Position.objects.create(scene=scene, number=number, label=label, bench=bench)

@@ -113,9 +113,9 @@ def is_simulated(resolved: Resolved) -> bool:
 
 def stored_deployments() -> list[StoredDeployment]:
     """Return all deployment files, oldest first."""
-    found = [StoredDeployment(path.stem, path) for path in _folder().glob("*.toml")]
+    rows = [StoredDeployment(path.stem, path) for path in _folder().glob("*.toml")]
     return sorted(
-        (one for one in found if re.fullmatch(STATION_NAME, one.name)), key=lambda one: one.changed_ns
+        (row for row in rows if re.fullmatch(STATION_NAME, row.name)), key=lambda row: row.changed_ns
     )
 
 
@@ -158,11 +158,11 @@ def write_draft(
         for place, typed in parts.items():
             part, _, key = place.partition(".")
             _require_no_program(part, typed)
-            found = draft.table(part, typed.get("kind", ""), typed)
+            table = draft.table(part, typed.get("kind", ""), typed)
             if key:
-                tree.setdefault(part, {})[key] = found
+                tree.setdefault(part, {})[key] = table
             else:
-                tree[part] = found
+                tree[part] = table
     except ConfigurationError as fault:
         raise EvaError(str(fault)) from None
     return _write(name, tree, f"Start it on the robot's computer: {command_of(_folder() / f'{name}.toml')}")
@@ -176,21 +176,21 @@ def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
     Raises:
         EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.
     """
-    found = stored_deployment(name)
-    tree = tree_of(found.path) if found else {}
+    stored = stored_deployment(name)
+    tree = tree_of(stored.path) if stored else {}
     own: dict[str, Any] = tree.get("cameras", {})
     if sorted(shown.values()) != sorted(shown):
         raise EvaError(f"each camera once: {', '.join(sorted(shown))}; given: {', '.join(shown.values())}")
     moved = {camera: right for camera, right in shown.items() if camera != right}
     foreign = sorted({*moved, *moved.values()} - set(own))
-    if foreign or found is None:
+    if foreign or stored is None:
         raise EvaError(
             f"{', '.join(foreign or moved)}: the robot's own node names these pictures: exchange them there, then look "
             "again"
         )
     tree["cameras"] = own | {right: own[camera] for camera, right in moved.items()}
     about = "Its cameras were exchanged on the page of first steps."
-    _put(found.path, tree, *([_CHOSEN] if found.chosen else []), about)
+    _put(stored.path, tree, *([_CHOSEN] if stored.chosen else []), about)
 
 
 def command_of(path: Path) -> str:
@@ -201,7 +201,7 @@ def command_of(path: Path) -> str:
 def faults_of(path: Path) -> str:
     """Return the errors that the runtime's own check finds in a deployment, "" if it would start."""
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             [
                 sys.executable,
                 "-m",
@@ -220,7 +220,7 @@ def faults_of(path: Path) -> str:
         )
     except subprocess.TimeoutExpired:
         return f"the check of {path.name} was not done within {_CHECK_S:g} s: check it with {command_of(path)} --check"
-    return "" if done.returncode == 0 else done.stderr.strip()
+    return "" if completed.returncode == 0 else completed.stderr.strip()
 
 
 def lab_runs() -> bool:
@@ -238,8 +238,8 @@ def lab_runs() -> bool:
 def standing_of(name: str) -> Standing:
     """Return the status of a deployment as last written by the lab."""
     try:
-        told = json.loads((_folder() / f"{name}.json").read_bytes())
-        return Standing(str(told["doing"]), bool(told["up"]), str(told["failed"]))
+        fields = json.loads((_folder() / f"{name}.json").read_bytes())
+        return Standing(str(fields["doing"]), bool(fields["up"]), str(fields["failed"]))
     except (OSError, ValueError, KeyError, TypeError):
         return Standing()
 
@@ -261,10 +261,10 @@ def try_again(*, name: str) -> None:
     Raises:
         NotFound: If there is none.
     """
-    found = stored_deployment(name)
-    if found is None:
+    stored = stored_deployment(name)
+    if stored is None:
         raise NotFound(f"{name!r:.80} has no deployment in the data folder")
-    found.path.touch()
+    stored.path.touch()
 
 
 def remove(*, name: str) -> None:
@@ -276,8 +276,8 @@ def remove(*, name: str) -> None:
         NotFound: If there is none.
         Conflict: If the station is in use.
     """
-    found = stored_deployment(name)
-    if found is None:
+    stored = stored_deployment(name)
+    if stored is None:
         raise NotFound(f"{name!r:.80} has no deployment in the data folder")
     station = Station.objects.filter(name=name).first()
     if station is not None:
@@ -288,7 +288,7 @@ def remove(*, name: str) -> None:
                 Station.objects.filter(name=name).update(
                     active=False, deployment="", message="removed under First steps"
                 )
-    found.path.unlink()
+    stored.path.unlink()
     (_folder() / f"{name}.json").unlink(missing_ok=True)
 
 
@@ -333,10 +333,10 @@ def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
         ConfigurationError: If the kind does not exist.
     """
     for entry in draft.entries(part, typed.get("kind", "")):
-        given = typed.get(entry.key, "").strip()
-        who = BY_HAND.get((part, entry.key))
-        if who and given not in ("", entry.default):
-            raise EvaError(f"{part}.{entry.key} = {given!r:.80}; allowed here: {entry.default}; {who}")
+        value = typed.get(entry.key, "").strip()
+        remark = BY_HAND.get((part, entry.key))
+        if remark and value not in ("", entry.default):
+            raise EvaError(f"{part}.{entry.key} = {value!r:.80}; allowed here: {entry.default}; {remark}")
 
 
 def _write(name: str, tree: dict[str, Any], about: str) -> StoredDeployment:

@@ -43,12 +43,12 @@ class Part:
     @property
     def asked(self) -> list[Typed]:
         """Keys whose values are addresses."""
-        return [one for one in self.keys if one.entry.address]
+        return [key for key in self.keys if key.entry.address]
 
     @property
     def further(self) -> list[Typed]:
         """Keys whose values are not addresses."""
-        return [one for one in self.keys if not one.entry.address]
+        return [key for key in self.keys if not key.entry.address]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class DraftForm:
         return {
             part.place: {
                 "kind": part.kind,
-                **{one.entry.key: one.value for one in (*part.keys, *part.hidden)},
+                **{key.entry.key: key.value for key in (*part.keys, *part.hidden)},
             }
             for part in self.parts
             if part.kind
@@ -80,32 +80,32 @@ def form_of(given: Mapping[str, str]) -> DraftForm:
     Raises:
         EvaError: If a robot or a kind does not exist; the message names the valid ones.
     """
-    known = tuple(robots.robot_names())
-    robot = given.get("robot", known[0])
-    if robot not in known:
-        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(known)}")
+    names = tuple(robots.robot_names())
+    robot = given.get("robot", names[0])
+    if robot not in names:
+        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(names)}")
     try:
         cameras = [f"cameras.{camera.key}" for camera in robots.load_robot(robot).cameras]
     except robots.RobotError as fault:  # a robot folder of the lab's own may be broken
         raise EvaError(str(fault)) from None
     parts = tuple(_part(place, given) for place in ("transport", "policy", *cameras))
-    return DraftForm(given.get("station", ""), robot, known, given.get("task", ""), parts)
+    return DraftForm(given.get("station", ""), robot, names, given.get("task", ""), parts)
 
 
-def _part(place: str, given: Mapping[str, str]) -> Part:
+def _part(place: str, values: Mapping[str, str]) -> Part:
     part, _, camera = place.partition(".")
-    known = {kind: what for kind, what in draft.kinds(part).items() if kind != "none"}
-    kind = given.get(f"{place}.kind", _USUAL[part])
-    if kind not in known and not (camera and kind == FROM_TRANSPORT):
-        raise EvaError(f"{place}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
+    kinds = {kind: description for kind, description in draft.kinds(part).items() if kind != "none"}
+    kind = values.get(f"{place}.kind", _USUAL[part])
+    if kind not in kinds and not (camera and kind == FROM_TRANSPORT):
+        raise EvaError(f"{place}.kind = {kind!r:.40}; allowed: {', '.join(kinds)}")
     try:
-        found = draft.entries(part, kind) if kind else ()
+        entries = draft.entries(part, kind) if kind else ()
     except ConfigurationError as fault:  # a plug-in that cannot be imported here
         raise EvaError(str(fault)) from None
     typed = tuple(
-        Typed(f"{place}.{entry.key}", entry, given.get(f"{place}.{entry.key}", entry.default))
-        for entry in found
+        Typed(f"{place}.{entry.key}", entry, values.get(f"{place}.{entry.key}", entry.default))
+        for entry in entries
     )
-    keys = tuple(one for one in typed if (part, one.entry.key) not in BY_HAND)
-    hidden = tuple(one for one in typed if (part, one.entry.key) in BY_HAND)
-    return Part(place, _TITLES.get(part, camera), kind, known, keys, hidden)
+    keys = tuple(key for key in typed if (part, key.entry.key) not in BY_HAND)
+    hidden = tuple(key for key in typed if (part, key.entry.key) in BY_HAND)
+    return Part(place, _TITLES.get(part, camera), kind, kinds, keys, hidden)

@@ -83,8 +83,8 @@ class Walk:
     @property
     def mark(self) -> str:
         """Fingerprint that changes whenever the displayed status changes."""
-        told = (self.name, self.standing, bool(self.snapshot), self.checkpoints, *self.steps)
-        return sha256(repr(told).encode()).hexdigest()[:16]
+        fields = (self.name, self.standing, bool(self.snapshot), self.checkpoints, *self.steps)
+        return sha256(repr(fields).encode()).hexdigest()[:16]
 
     @property
     def waits(self) -> bool:
@@ -108,18 +108,18 @@ def walk(*, name: str = "") -> Walk:
     If there is no such station, they are those of the newest.
     """
     stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
-    kept = stored_deployment(name) if name else None
-    station = next((one for one in stations if one.name == name), None)
-    if station is None and kept is None:
-        station, kept = _newest(stations)
+    stored = stored_deployment(name) if name else None
+    station = next((row for row in stations if row.name == name), None)
+    if station is None and stored is None:
+        station, stored = _newest(stations)
     elif station is not None:
-        kept = stored_deployment(station.name)
+        stored = stored_deployment(station.name)
     snapshot = _snapshot(station)
     cameras = tuple(cameras_of(station)) if station else ()
     scored = _scored(station)
     checkpoints = Checkpoint.objects.filter(active=True).exists()
-    done = {
-        "deployment": station is not None or kept is not None,
+    completed = {
+        "deployment": station is not None or stored is not None,
         "station": bool(snapshot) or scored is not None,
         "cameras": scored is not None or _looked_at(station) or (bool(snapshot) and not cameras),
         "home": scored is not None or _homed(station),
@@ -130,15 +130,15 @@ def walk(*, name: str = "") -> Walk:
     }
     return Walk(
         station=station,
-        kept=kept,
-        standing=standing_of(kept.name) if kept else Standing(),
-        simulated=_simulated(station, kept),
+        kept=stored,
+        standing=standing_of(stored.name) if stored else Standing(),
+        simulated=_simulated(station, stored),
         snapshot=snapshot,
         cameras=cameras,
-        steps=_steps(done),
+        steps=_steps(completed),
         checkpoints=checkpoints,
         scored=scored,
-        others=tuple(one for one in stations if one != station),
+        others=tuple(row for row in stations if row != station),
     )
 
 
@@ -165,13 +165,13 @@ def _newest(stations: tuple[Station, ...]) -> tuple[Station | None, StoredDeploy
     return station, stored_deployment(station.name) if station else None
 
 
-def _steps(done: dict[str, bool]) -> tuple[Step, ...]:
-    open_ones = [name for name in _TITLES if not done[name]]
+def _steps(completed: dict[str, bool]) -> tuple[Step, ...]:
+    open_ones = [name for name in _TITLES if not completed[name]]
     return tuple(
         Step(
             name,
             title,
-            Progress.DONE if done[name] else Progress.NOW if name == open_ones[0] else Progress.LATER,
+            Progress.DONE if completed[name] else Progress.NOW if name == open_ones[0] else Progress.LATER,
         )
         for name, title in _TITLES.items()
     )
@@ -186,11 +186,11 @@ def _snapshot(station: Station | None) -> dict[str, Any]:
         return {}
 
 
-def _simulated(station: Station | None, kept: StoredDeployment | None) -> bool:
+def _simulated(station: Station | None, stored: StoredDeployment | None) -> bool:
     if station is not None:
         return station.simulated
     try:
-        return kept is not None and kept.chosen and is_simulated(kept.resolved())
+        return stored is not None and stored.chosen and is_simulated(stored.resolved())
     except LabError:  # its step reports the error
         return False
 

@@ -83,15 +83,15 @@ def open_lab(
 
     `stop_port` defaults to the port after `port`. Port 0 is a free port.
     """
-    told = progress or silent()
+    reporter = progress or silent()
     if stop_port is None:
         stop_port = port + 1 if port else 0
-    for wanted, option in ((port, "--port"), (stop_port, "--stop-port")):
-        if wanted:
-            lifetime.require_free(host, wanted, option)
+    for number, option in ((port, "--port"), (stop_port, "--stop-port")):
+        if number:
+            lifetime.require_free(host, number, option)
     with lifetime.hold_data_folder(settings.DATA_DIR):
         lifetime.end_on_signals()
-        with told.step("the database"):
+        with reporter.step("the database"):
             call_command("migrate", verbosity=0, interactive=False)
             lab_folder_named()
         environment = program_environment(os.environ) | {
@@ -101,9 +101,9 @@ def open_lab(
         processes = ChildProcesses(settings.BASE_DIR, settings.DATA_DIR / "logs", environment)
         with open_listener(host, stop_port) as listener:
             try:
-                yield Lab(processes, host, port, listener, told)
+                yield Lab(processes, host, port, listener, reporter)
             finally:
-                with told.during("ending"):
+                with reporter.during("ending"):
                     processes.end()
                 first_account.withdraw()
                 remove_stop_port()

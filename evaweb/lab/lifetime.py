@@ -69,8 +69,8 @@ def end_on_signals() -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    for each in _ENDS:
-        signal.signal(each, signal.SIG_IGN)
+    for end_signal in _ENDS:
+        signal.signal(end_signal, signal.SIG_IGN)
     if number == signal.SIGHUP:  # there is no terminal for further output
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for descriptor in (1, 2):

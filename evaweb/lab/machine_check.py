@@ -76,9 +76,9 @@ def lines() -> list[Line]:
 def realtime() -> Line:
     """Check whether a station started by this account gets SCHED_FIFO and locked memory, by trying in a process."""
     means = "Control ticks on time however busy the machine is, where it has the class SCHED_FIFO and locked memory."
-    said = _output([sys.executable, "-c", _TRY.format(_PRIORITY)])
+    output = _output([sys.executable, "-c", _TRY.format(_PRIORITY)])
     try:
-        got, advice = json.loads(said or "")
+        got, advice = json.loads(output or "")
     except ValueError:
         return Line("Real-time rights", State.UNKNOWN, "could not be tried", means)
     locked = "unlocked" not in got
@@ -94,32 +94,30 @@ def cores() -> Line:
     """Check the processor cores that this account may use."""
     count, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     means = "A station runs five processes, two of them in real time; web, worker and policy servers share the rest."
-    found = f"{count} cores, load {load:.1f}"
+    text = f"{count} cores, load {load:.1f}"
     if count < 2:
-        return Line("Cores", State.BAD, found, means, "use a machine with four or more cores")
+        return Line("Cores", State.BAD, text, means, "use a machine with four or more cores")
     if count < 4:
         advice = (
             "it is enough for one station; small camera pictures and no policy server beside it spare work"
         )
-        return Line("Cores", State.LACKING, found, means, advice)
-    return Line("Cores", State.GOOD, found, means)
+        return Line("Cores", State.LACKING, text, means, advice)
+    return Line("Cores", State.GOOD, text, means)
 
 
 def memory() -> Line:
     """Check the available main memory."""
     facts = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text("ascii").splitlines())
     total, free = (int(facts[key].split()[0]) * 1024 for key in ("MemTotal", "MemAvailable"))
-    found = f"{free / _GB:.1f} of {total / _GB:.1f} GB available"
+    text = f"{free / _GB:.1f} of {total / _GB:.1f} GB available"
     means = "Web, worker, each station and each policy server of this machine share it."
     if free < 0.5 * _GB:
-        return Line(
-            "Memory", State.BAD, found, means, "end other programs, or use a machine with more memory"
-        )
+        return Line("Memory", State.BAD, text, means, "end other programs, or use a machine with more memory")
     if free < 2 * _GB:
         return Line(
-            "Memory", State.LACKING, found, means, "watch it: what runs beside the lab should be small"
+            "Memory", State.LACKING, text, means, "watch it: what runs beside the lab should be small"
         )
-    return Line("Memory", State.GOOD, found, means)
+    return Line("Memory", State.GOOD, text, means)
 
 
 def shared_memory() -> Line:
@@ -162,12 +160,12 @@ def disk_speed() -> Line:
     finally:
         path.unlink(missing_ok=True)
     rate = written * _PIECE / 1e6 / (time.monotonic() - begun)
-    found = f"{rate:.0f} MB/s with every megabyte flushed, the longest flush {1000 * worst:.0f} ms"
+    text = f"{rate:.0f} MB/s with every megabyte flushed, the longest flush {1000 * worst:.0f} ms"
     if rate < 20:
         return Line(
-            "Disk, speed", State.LACKING, found, means, "a local SSD is faster; a network folder is a risk"
+            "Disk, speed", State.LACKING, text, means, "a local SSD is faster; a network folder is a risk"
         )
-    return Line("Disk, speed", State.GOOD, found, means)
+    return Line("Disk, speed", State.GOOD, text, means)
 
 
 def clock() -> Line:
@@ -180,27 +178,27 @@ def clock() -> Line:
     if tracking and "Leap status" in tracking:
         facts = dict(map(str.strip, line.split(":", 1)) for line in tracking.splitlines() if ":" in line)
         good = facts["Leap status"] == "Normal"
-        found = f"chrony: {facts['Leap status'].lower()}, {facts.get('System time', 'offset not told')}"
-        return Line("Clock", State.GOOD if good else State.LACKING, found, means, "" if good else advice)
+        text = f"chrony: {facts['Leap status'].lower()}, {facts.get('System time', 'offset not told')}"
+        return Line("Clock", State.GOOD if good else State.LACKING, text, means, "" if good else advice)
     word = (_output(["timedatectl", "show", "--property", "NTPSynchronized", "--value"]) or "").strip()
     if word in ("yes", "no"):
-        found = "systemd: synchronised" if word == "yes" else "systemd: not synchronised"
+        text = "systemd: synchronised" if word == "yes" else "systemd: not synchronised"
         return Line(
             "Clock",
             State.GOOD if word == "yes" else State.LACKING,
-            found,
+            text,
             means,
             "" if word == "yes" else advice,
         )
-    found = "neither chrony nor systemd answers here"
-    return Line("Clock", State.UNKNOWN, found, means, "in a container the host's clock counts: look there")
+    text = "neither chrony nor systemd answers here"
+    return Line("Clock", State.UNKNOWN, text, means, "in a container the host's clock counts: look there")
 
 
 def gpu() -> Line:
     """Check for GPUs for policy servers, according to nvidia-smi."""
     means = "Policy servers want one; a lab whose servers are elsewhere, or scripted, needs none."
-    asked = ["nvidia-smi", "--query-gpu=name,memory.used,memory.total", "--format=csv,noheader"]
-    rows = (_output(asked) or "").strip()
+    command = ["nvidia-smi", "--query-gpu=name,memory.used,memory.total", "--format=csv,noheader"]
+    rows = (_output(command) or "").strip()
     if not rows:
         return Line("GPU of policy servers", State.UNKNOWN, "none seen", means)
     return Line("GPU of policy servers", State.GOOD, "; ".join(rows.splitlines()), means)
@@ -209,41 +207,43 @@ def gpu() -> Line:
 def sockets() -> Line:
     """Check the folder of the account's sockets, which may be removed at its last logout."""
     means = "Web and stations meet in Unix sockets there."
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    if not given:
+    folder = os.environ.get("XDG_RUNTIME_DIR")
+    if not folder:
         return Line("Sockets", State.GOOD, "a folder of this account's own, not one of systemd's", means)
-    if not os.access(given, os.W_OK):
+    if not os.access(folder, os.W_OK):
         advice = "log in anew, or start the lab without XDG_RUNTIME_DIR"
-        return Line("Sockets", State.BAD, f"{given} cannot be written", means, advice)
+        return Line("Sockets", State.BAD, f"{folder} cannot be written", means, advice)
     lingers = Path("/var/lib/systemd/linger", getpass.getuser()).exists() or os.geteuid() == 0
     if lingers:
-        return Line("Sockets", State.GOOD, given, means)
+        return Line("Sockets", State.GOOD, folder, means)
     advice = f"`loginctl enable-linger {getpass.getuser()}` where no login of the account stays open"
-    return Line("Sockets", State.LACKING, f"{given}, which ends with the account's last login", means, advice)
+    return Line(
+        "Sockets", State.LACKING, f"{folder}, which ends with the account's last login", means, advice
+    )
 
 
 def ports() -> Line:
     """Check the ports of web and stops: those of the running lab, else the default ones."""
     means = "Browsers reach the web at one, and its process for stops at the other."
-    kept = read_stop_port()
-    if lab_runs() and kept:
-        return Line("Ports", State.GOOD, f"web {kept.web_port}, stops {kept.port}: this lab's", means)
-    taken = []
+    stored = read_stop_port()
+    if lab_runs() and stored:
+        return Line("Ports", State.GOOD, f"web {stored.web_port}, stops {stored.port}: this lab's", means)
+    occupied = []
     for port in _PORTS:
         try:
             lifetime.require_free("127.0.0.1", port)
         except EvaError:
-            taken.append(port)
-    if taken:
-        found = f"{' and '.join(map(str, taken))} taken by another program"
-        return Line("Ports", State.LACKING, found, means, "start the lab with --port, and --stop-port")
+            occupied.append(port)
+    if occupied:
+        text = f"{' and '.join(map(str, occupied))} taken by another program"
+        return Line("Ports", State.LACKING, text, means, "start the lab with --port, and --stop-port")
     return Line("Ports", State.GOOD, f"{' and '.join(map(str, _PORTS))} are free", means)
 
 
 def stations() -> list[Line]:
     """Return the real-time scheduling that each running station reports."""
     means = "Control sends, and reception sees: each is on time where it runs in SCHED_FIFO."
-    found = []
+    station_lines = []
     try:
         names = list(Station.objects.filter(active=True).values_list("name", flat=True))
     except Error:  # a lab has no tables before its first start
@@ -257,10 +257,12 @@ def stations() -> list[Line]:
             str((snapshot.get(part) or {}).get("scheduling", "")) for part in ("control", "link")
         )
         good = control.startswith("FIFO") and "unlocked" not in control
-        said = f"control {control or 'not told'}, reception {reception or 'not told'}"
+        text = f"control {control or 'not told'}, reception {reception or 'not told'}"
         advice = "" if good else "give the station's account the rights above, then start it anew"
-        found.append(Line(f"Station {name}", State.GOOD if good else State.LACKING, said, means, advice))
-    return found
+        station_lines.append(
+            Line(f"Station {name}", State.GOOD if good else State.LACKING, text, means, advice)
+        )
+    return station_lines
 
 
 def _room(name: str, folder: Path, least_gb: float, good_gb: float, means: str, advice: str) -> Line:
@@ -269,20 +271,20 @@ def _room(name: str, folder: Path, least_gb: float, good_gb: float, means: str, 
     except OSError as error:
         return Line(name, State.UNKNOWN, f"{folder}: {error.strerror}", means)
     free = usage.free / _GB
-    found = f"{free:.1f} of {usage.total / _GB:.1f} GB in {folder}"
+    text = f"{free:.1f} of {usage.total / _GB:.1f} GB in {folder}"
     if free < least_gb:
-        return Line(name, State.BAD, found, means, advice)
+        return Line(name, State.BAD, text, means, advice)
     if free < good_gb:
-        return Line(name, State.LACKING, found, means, advice)
-    return Line(name, State.GOOD, found, means)
+        return Line(name, State.LACKING, text, means, advice)
+    return Line(name, State.GOOD, text, means)
 
 
 def _output(arguments: Sequence[str]) -> str | None:
     """Return the output of a program; None if it is missing, fails, or takes too long."""
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             arguments, capture_output=True, text=True, timeout=_PATIENCE_S, cwd=settings.BASE_DIR, check=True
         )
     except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return None
-    return done.stdout
+    return completed.stdout

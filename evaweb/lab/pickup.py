@@ -65,10 +65,10 @@ class Pickup:
             log.exception("%s cannot be started", name)
             self._give_up(name, f"{type(fault).__name__}: {fault} (see the terminal of the lab)")
 
-    def _give_up(self, name: str, why: str) -> None:
+    def _give_up(self, name: str, reason: str) -> None:
         self._coming = None
         self._end(name)
-        self._write_status(name, Standing(failed=why))
+        self._write_status(name, Standing(failed=reason))
 
     def _end(self, name: str) -> None:
         """End the programs that were started for a station."""
@@ -88,36 +88,36 @@ class Pickup:
 
     def _next(self) -> tuple[str, Coming] | None:
         ending = self._processes.ending()
-        for one in deployments.stored_deployments():
-            if ending.intersection(_programs_of(one.name)):
+        for stored in deployments.stored_deployments():
+            if ending.intersection(_programs_of(stored.name)):
                 continue  # programs of an earlier file with this name
-            if one.name not in self._up and self._tried.get(one.name) != one.changed_ns:
-                self._tried[one.name] = one.changed_ns
-                return one.name, self._starting(one)
+            if stored.name not in self._up and self._tried.get(stored.name) != stored.changed_ns:
+                self._tried[stored.name] = stored.changed_ns
+                return stored.name, self._starting(stored)
         return None
 
-    def _starting(self, one: StoredDeployment) -> Coming:
-        resolved = one.resolved()
-        if not (one.chosen and is_simulated(resolved)):
+    def _starting(self, stored: StoredDeployment) -> Coming:
+        resolved = stored.resolved()
+        if not (stored.chosen and is_simulated(resolved)):
             return False  # a draft, or written by hand: a person starts it
-        if resolved.deployment.station != one.name:
+        if resolved.deployment.station != stored.name:
             raise LabError(
-                f"{one.path} is of station {resolved.deployment.station!r}: name the file after it"
+                f"{stored.path} is of station {resolved.deployment.station!r}: name the file after it"
             )
         running = self._processes.pids()
-        for program in _programs_of(one.name):
+        for program in _programs_of(stored.name):
             if program in running:
                 raise LabError(
                     f"{program} is a program of this lab already: remove this station, and give it another name"
                 )
-        self._brought.add(one.name)
+        self._brought.add(stored.name)
         close_old_connections()
         yield "the simulated bench"
         assignments = yield from simulated.bring(
-            self._processes, one.name, resolved.deployment.robot, self._how
+            self._processes, stored.name, resolved.deployment.robot, self._how
         )
         yield "the station"
-        bench = Bench(one.path, assignments)
+        bench = Bench(stored.path, assignments)
         registered(bench)  # raises LabError if the file was removed meanwhile
         self._processes.start(program_of(bench))
         return True

@@ -51,37 +51,43 @@ def run_plan(
     Raises:
         DemoFailed: If a trial cannot be completed, or reveals its checkpoint.
     """
-    made = []
+    trials = []
     with closing(LivePage(operator, station)) as page:
         claim_station(page)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
             try:
                 with progress.during(f"trial {number} of {count}"):
-                    one = _run_trial(operator, page, station, plan)
+                    trial = _run_trial(operator, page, station, plan)
             except DemoFailed:
                 if operator.get(f"plans/{plan}")["state"] == "frozen":
                     raise
                 tell(f"the plan's design has ended after {number - 1} trials")
                 break
-            made.append(one)
-            verdict = "success" if one.success else "no success"
-            tell(f"{number:>3} of {count}  {one.code}  position {one.position}  {verdict}, {one.score:.0%}")
-    return [replace(one, duration_s=wait_for_recorded(operator, one.trial)["duration_s"]) for one in made]
+            trials.append(trial)
+            verdict = "success" if trial.success else "no success"
+            tell(
+                f"{number:>3} of {count}  {trial.code}  position {trial.position}  {verdict}, {trial.score:.0%}"
+            )
+    return [
+        replace(trial, duration_s=wait_for_recorded(operator, trial.trial)["duration_s"]) for trial in trials
+    ]
 
 
 def close_and_reveal(owner: RestClient, plan: str, made: list[CompletedTrial]) -> dict[str, Any]:
     """Close and reveal the plan; return commitment, key, and the trials with the names of their checkpoints."""
     if owner.get(f"plans/{plan}")["state"] == "frozen":  # else its design has ended it
         owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
-    told = owner.post(f"plans/{plan}/reveal", {})
-    trials = [{**asdict(one), "checkpoint": owner.get(f"trials/{one.trial}")["checkpoint"]} for one in made]
+    fields = owner.post(f"plans/{plan}/reveal", {})
+    trials = [
+        {**asdict(trial), "checkpoint": owner.get(f"trials/{trial.trial}")["checkpoint"]} for trial in made
+    ]
     return {
-        "plan": told["name"],
-        "version": told["version"],
-        "digest": told["digest"],
-        "commitment": told["commitment"],
-        "key": told["key"],
+        "plan": fields["name"],
+        "version": fields["version"],
+        "digest": fields["digest"],
+        "commitment": fields["commitment"],
+        "key": fields["key"],
         "trials": trials,
     }
 

@@ -92,18 +92,18 @@ class ChildProcesses:
         `start` does.
         """
         begun = self.starting(program, ready_s, wait_s=0.2)
-        found: list[Mapping[str, Any]] = []
+        announcements: list[Mapping[str, Any]] = []
 
         def look() -> None:
             try:
                 next(begun)
             except StopIteration as ready:
-                found.append(ready.value)
+                announcements.append(ready.value)
 
         def wait() -> Mapping[str, Any]:
-            while not found:
+            while not announcements:
                 look()
-            return found[0]
+            return announcements[0]
 
         look()
         return wait
@@ -225,14 +225,14 @@ class ChildProcesses:
                 yield
         line = output.readline()
         try:
-            found = json.loads(line)
+            announcement = json.loads(line)
         except ValueError:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.process.wait(5)
             raise LabError(f"{child.program.name} did not start: {self._why(child)}") from None
-        if not isinstance(found, dict):
-            raise LabError(f"{child.program.name} announced {found!r}; expected a map of addresses")
-        return found
+        if not isinstance(announcement, dict):
+            raise LabError(f"{child.program.name} announced {announcement!r}; expected a map of addresses")
+        return announcement
 
     def _why(self, child: _Child) -> str:
         path = self._logs / f"{child.program.name}.log"
@@ -266,7 +266,7 @@ class ChildProcesses:
 def processor_s(pid: int) -> float:
     """Return the processor time of a process and of the children it has waited for [s]; 0 if it has ended."""
     try:
-        told = Path(f"/proc/{pid}/stat").read_text("ascii", "replace")
+        text = Path(f"/proc/{pid}/stat").read_text("ascii", "replace")
     except OSError:
         return 0.0
-    return sum(map(int, told.rpartition(")")[2].split()[11:15])) / os.sysconf("SC_CLK_TCK")
+    return sum(map(int, text.rpartition(")")[2].split()[11:15])) / os.sysconf("SC_CLK_TCK")

@@ -111,8 +111,8 @@ def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
 
 def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tuple[str, ...]:
     """Return the arguments of runtime.standins.serve for a scripted policy that uses the images."""
-    what = ("openpi", "--robot", robot, "--behaviour", "pick_place")
-    return (*what, "--name", name, "--port", str(port), *options)
+    kind = ("openpi", "--robot", robot, "--behaviour", "pick_place")
+    return (*kind, "--name", name, "--port", str(port), *options)
 
 
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:

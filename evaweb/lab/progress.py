@@ -26,18 +26,18 @@ class Progress:
     def during(self, what: str) -> Iterator[None]:
         """Report an unnumbered activity for the duration of the block."""
         self._print(f"{what}\n")
-        done = threading.Event()
-        ticking = threading.Thread(target=self._tick, args=(done,), daemon=True)
+        finished = threading.Event()
+        ticking = threading.Thread(target=self._tick, args=(finished,), daemon=True)
         ticking.start()
         try:
             yield
         finally:
-            done.set()
+            finished.set()
             ticking.join()
 
-    def _tick(self, done: threading.Event) -> None:
+    def _tick(self, finished: threading.Event) -> None:
         took = 0.0
-        while not done.wait(_EVERY_S):
+        while not finished.wait(_EVERY_S):
             took += _EVERY_S
             self._print(f"  ... still at it, {took:.0f} s\n")
 

@@ -66,10 +66,10 @@ class RestClient:
             DemoFailed: If name or password is wrong.
         """
         page = self._open(Request(f"{self.url}/login/")).decode()
-        found = _TOKEN.search(page)
-        if not found:
+        match = _TOKEN.search(page)
+        if not match:
             raise DemoFailed(f"{self.url}/login/ has no login form")
-        form = {"username": username, "password": password, "csrfmiddlewaretoken": found[1]}
+        form = {"username": username, "password": password, "csrfmiddlewaretoken": match[1]}
         request = Request(f"{self.url}/login/", urlencode(form).encode(), {"Referer": f"{self.url}/login/"})
         try:
             self._opener.open(request, timeout=_TIMEOUT_S).close()
@@ -101,14 +101,14 @@ class RestClient:
     @property
     def csrf_token(self) -> str:
         """CSRF token for requests with changes, "" if there is none."""
-        found = (cookie.value for cookie in self._cookies if cookie.name.startswith("eva_csrf_"))
-        return next(found, None) or ""
+        tokens = (cookie.value for cookie in self._cookies if cookie.name.startswith("eva_csrf_"))
+        return next(tokens, None) or ""
 
     @property
     def session_name(self) -> str:
         """Name of the session cookie, whose suffix differs by lab; "" if there is none."""
-        found = (cookie.name for cookie in self._cookies if cookie.name.startswith("eva_session_"))
-        return next(found, "")
+        names = (cookie.name for cookie in self._cookies if cookie.name.startswith("eva_session_"))
+        return next(names, "")
 
     @property
     def cookies(self) -> str:
@@ -137,12 +137,12 @@ class RestClient:
 def _sentence(body: str) -> str:
     """Return the sentence in the body of an error."""
     try:
-        found = json.loads(body)
+        fields = json.loads(body)
     except ValueError:
         return body[:300]
-    if isinstance(found, dict):
-        return str(found.get("error") or found.get("reason") or found.get("detail") or found)
-    return str(found)
+    if isinstance(fields, dict):
+        return str(fields.get("error") or fields.get("reason") or fields.get("detail") or fields)
+    return str(fields)
 
 
 def _words(state: Mapping[str, Any]) -> str:
@@ -287,9 +287,9 @@ class LivePage:
         if message.get("type") == "renewed" and message.get("lost") and message.get("epoch") == self.epoch:
             self._fail(f"the lease was lost: {message.get('reason')}")
 
-    def _fail(self, why: str) -> None:
+    def _fail(self, reason: str) -> None:
         with self._changed:
-            self._failure = self._failure or why
+            self._failure = self._failure or reason
             self._changed.notify_all()
 
     def _renew(self) -> None:

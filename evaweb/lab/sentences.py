@@ -60,12 +60,12 @@ def of_scripts() -> list[Entry]:
     Raises:
         ValueError: If an id has two texts, or a call cannot be parsed.
     """
-    found: list[Entry] = []
+    entries: list[Entry] = []
     for path, source in _sources("static", "*.js"):
         read = [(id, json.loads(english)) for id, english in _SCRIPT.findall(source)]
         _require_all(path, source.count(' t("') + source.count('(t("') + source.count("{t("), len(read))
-        found += [Entry(id, english, names_of(english)) for id, english in read]
-    return once(found)
+        entries += [Entry(id, english, names_of(english)) for id, english in read]
+    return once(entries)
 
 
 def of_templates() -> list[Entry]:
@@ -74,37 +74,37 @@ def of_templates() -> list[Entry]:
     Raises:
         ValueError: If an id has two texts, or a tag cannot be parsed.
     """
-    found: list[Entry] = []
+    entries: list[Entry] = []
     for path, source in _sources("templates", "*.html"):
         read = _TEMPLATE.findall(source)
         _require_all(path, source.count("{% t "), len(read))
-        found += [
+        entries += [
             Entry(id, " ".join(english.split()), frozenset(_VALUE.findall(values)))
             for id, values, english in read
         ]
-    return once(found)
+    return once(entries)
 
 
 def of_labels() -> list[Entry]:
     """Return the labels of `{% label %}`: columns, filters, tabs, roles and choices."""
-    found = {
+    texts = {
         text for path, source in _sources("evaweb", "*.py") for text in _labels(ast.parse(source, str(path)))
     }
-    found |= {role.value for role in Role}
-    found |= {words for words, _ in (*QUALITY.values(), *REVIEW.values())} | {
+    texts |= {role.value for role in Role}
+    texts |= {label for label, _ in (*QUALITY.values(), *REVIEW.values())} | {
         *RESULTS,
         *VERDICTS,
         "every attempt",
     }
     for model in apps.get_models():
         if model.__module__.startswith("evaweb."):
-            found |= {str(text) for field in model._meta.fields for _, text in field.flatchoices}
-    return once(Entry(label_id(text), text.casefold(), frozenset()) for text in sorted(found) if text)
+            texts |= {str(text) for field in model._meta.fields for _, text in field.flatchoices}
+    return once(Entry(label_id(text), text.casefold(), frozenset()) for text in sorted(texts) if text)
 
 
 def catalogue(entries: Iterable[Entry]) -> list[dict[str, Any]]:
     """Return id, English text and argument names of each entry."""
-    return [{"id": one.id, "english": one.english, "arguments": sorted(one.names)} for one in entries]
+    return [{"id": entry.id, "english": entry.english, "arguments": sorted(entry.names)} for entry in entries]
 
 
 def compared(entries: Sequence[Entry], translated: Mapping[str, str]) -> dict[str, list[str]]:
@@ -113,12 +113,12 @@ def compared(entries: Sequence[Entry], translated: Mapping[str, str]) -> dict[st
     "missing": not translated; "unknown": not in the catalogue; "other_arguments": the translated text has unknown
     arguments or cannot be parsed.
     """
-    english = {one.id: one for one in entries}
+    english = {entry.id: entry for entry in entries}
     return {
         "missing": [id for id in english if id not in translated],
         "unknown": [id for id in translated if id not in english],
         "other_arguments": [
-            id for id, words in translated.items() if id in english and not _fits(english[id], words)
+            id for id, text in translated.items() if id in english and not _fits(english[id], text)
         ],
     }
 
@@ -129,11 +129,11 @@ def once(entries: Iterable[Entry]) -> list[Entry]:
     Raises:
         ValueError: If an id has two texts.
     """
-    found: dict[str, Entry] = {}
-    for one in entries:
-        if found.setdefault(one.id, one) != one:
-            raise ValueError(f"{one.id} is two texts: {found[one.id].english!r} and {one.english!r}")
-    return [found[id] for id in sorted(found)]
+    by_id: dict[str, Entry] = {}
+    for entry in entries:
+        if by_id.setdefault(entry.id, entry) != entry:
+            raise ValueError(f"{entry.id} is two texts: {by_id[entry.id].english!r} and {entry.english!r}")
+    return [by_id[id] for id in sorted(by_id)]
 
 
 def _labels(tree: ast.AST) -> Iterator[str]:
@@ -168,8 +168,8 @@ def _require_all(path: Path, written: int, read: int) -> None:
         raise ValueError(f"{path}: {written} texts with an id are written there, {read} can be read")
 
 
-def _fits(english: Entry, words: str) -> bool:
+def _fits(english: Entry, text: str) -> bool:
     try:
-        return names_of(words) <= english.names
+        return names_of(text) <= english.names
     except ValueError:
         return False

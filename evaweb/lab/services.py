@@ -44,10 +44,10 @@ def bundle_get(*, user: User, name: str) -> Path:
     Raises:
         NotFound: If there is none of that name.
     """
-    found = next((path for path in bundles(user=user) if path.name == name), None)
-    if found is None:
+    bundle = next((path for path in bundles(user=user) if path.name == name), None)
+    if bundle is None:
         raise NotFound(f"{name!r:.80} is no bundle of yours; it may have been replaced by newer ones")
-    return found
+    return bundle
 
 
 def _key(user: User) -> str:

@@ -85,8 +85,8 @@ def bring(
         name = f"{policy}-{robot}"
         serving = programs.policy(name, robot, how.skill(policy), known_port(name))
         if serving.name not in processes.pids():
-            found = yield from _starting(processes, serving, f"the policy {name}")
-            demo_rows.demo_checkpoint(name=name, description=description, policy={"url": found["url"]})
+            addresses = yield from _starting(processes, serving, f"the policy {name}")
+            demo_rows.demo_checkpoint(name=name, description=description, policy={"url": addresses["url"]})
     url = _url_of(f"{SKILLED}-{robot}")
     return [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',
@@ -97,16 +97,16 @@ def bring(
 
 
 def _starting(
-    processes: ChildProcesses, program: ProgramSpec, what: str
+    processes: ChildProcesses, program: ProgramSpec, label: str
 ) -> Generator[str, None, Mapping[str, Any]]:
     begun = processes.starting(program)
     while True:
         try:
             next(begun)
         except StopIteration as ready:
-            found: Mapping[str, Any] = ready.value
-            return found
-        yield what
+            addresses: Mapping[str, Any] = ready.value
+            return addresses
+        yield label
 
 
 def known_port(name: str) -> int:
@@ -141,8 +141,8 @@ def _pixels(text: str) -> tuple[int, int]:
     """Return width and height of "400x300", the smallest size at which the scripted policies always detect
     the block.
     """
-    found = re.fullmatch(r"(\d{3,4})x(\d{3,4})", text)
-    width, height = (int(found[1]), int(found[2])) if found else (0, 0)
+    match = re.fullmatch(r"(\d{3,4})x(\d{3,4})", text)
+    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
     if not (400 <= width <= 4096 and 300 <= height <= 4096):
         raise ArgumentTypeError(f"{text!r}; allowed: width x height in pixels, 400x300 to 4096x4096")
     return width, height

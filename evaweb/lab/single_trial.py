@@ -162,16 +162,16 @@ def score_by_truth(visitor: RestClient, trial: int) -> Mapping[str, Any]:
         "waiting for the end of the trial and the bench's truth",
     )
     milestones = visitor.get(f"scenes/{facts['scene']}")["milestones"]
-    said = facts["truth"]["milestones"]
-    reached = {str(milestone["id"]): bool(said.get(milestone["truth"])) for milestone in milestones}
+    truth = facts["truth"]["milestones"]
+    reached = {str(milestone["id"]): bool(truth.get(milestone["truth"])) for milestone in milestones}
     when = {
         str(milestone["id"]): facts["truth"].get("reached", {}).get(milestone["truth"])
         for milestone in milestones
         if reached[str(milestone["id"])]
     }
     wait_for_recorded(visitor, trial)
-    words = {"note": "scored from the bench's truth", "source": "truth"}
-    content = {"milestones": reached, "times": when, "uuid": str(uuid4()), **words}
+    remarks = {"note": "scored from the bench's truth", "source": "truth"}
+    content = {"milestones": reached, "times": when, "uuid": str(uuid4()), **remarks}
     scored: Mapping[str, Any] = wait_until(
         lambda: visitor.post(f"trials/{trial}/score", content), lambda found: True, "scoring"
     )
@@ -189,7 +189,7 @@ def _published(visitor: RestClient, episode: str) -> Mapping[str, Any]:
     return _worked_on(visitor, episode, ("dataset_index", "duration_s"), "waiting for the dataset")
 
 
-def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) -> Mapping[str, Any]:
+def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], label: str) -> Mapping[str, Any]:
     """Return the episode as soon as these facts of it are known; any activity of the worker counts as progress.
 
     Raises:
@@ -202,17 +202,17 @@ def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) 
     def known(found: tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]) -> bool:
         for job in found[1]:
             if job["key"] == f"publish:{uuid}" and job["status"] == "failed":
-                raise DemoFailed(f"{what}: job {job['key']} has failed: {job['error']}")
+                raise DemoFailed(f"{label}: job {job['key']} has failed: {job['error']}")
         return all(found[0][name] is not None for name in facts)
 
-    return wait_until(ask, known, what)[0]
+    return wait_until(ask, known, label)[0]
 
 
 def wait_for_recording(visitor: RestClient, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the trial as soon as its duration is that of its recording; until then it is that of the commands."""
-    found: Mapping[str, Any] = wait_until(
+    recorded: Mapping[str, Any] = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda facts: facts["duration_s"] == episode["duration_s"],
         "waiting for the exact duration",
     )
-    return found
+    return recorded

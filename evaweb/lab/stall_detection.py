@@ -57,11 +57,11 @@ def wait_until(
     patience = ProgressTimeout(what)
     while True:
         try:
-            found = ask()
+            state = ask()
         except NoReply as fault:
             patience.update(None, fault)
         else:
-            if reached(found):
-                return found
-            patience.update(mark(found), found)
+            if reached(state):
+                return state
+            patience.update(mark(state), state)
         time.sleep(_AGAIN_S)

@@ -49,10 +49,10 @@ class FirstAccountForm(forms.Form):
 
     def clean_code(self) -> str:
         """Check the code."""
-        given: str = self.cleaned_data["code"]
-        if not first_account.is_code(given):
+        code: str = self.cleaned_data["code"]
+        if not first_account.is_code(code):
             raise ValidationError("this is not the code that the lab shows in its terminal")
-        return given
+        return code
 
     def clean(self) -> dict[str, Any]:
         """Check the password by the lab's rules."""
@@ -74,8 +74,8 @@ def make_first_account(request: HttpRequest) -> HttpResponse:
         return redirect("login")
     form = FirstAccountForm(request.POST or None)
     if request.method == "POST" and form.is_valid():
-        given = {key: form.cleaned_data[key] for key in ("username", "password")}
-        login(request, first_account.administrator_make(**given), backend=_BACKEND)
+        credentials = {key: form.cleaned_data[key] for key in ("username", "password")}
+        login(request, first_account.administrator_make(**credentials), backend=_BACKEND)
         return redirect("first-steps")
     return render(request, "registration/first_account.html", {"form": form})
 
@@ -120,12 +120,12 @@ def draft(request: HttpRequest) -> HttpResponse:
         return render(request, "lab/draft_form.html", {"draft": form_of(request.GET.dict())})
     form = form_of(request.POST.dict())
     name = form.name.strip()
-    given = {"name": name, "robot": form.robot, "task": form.task}
+    values = {"name": name, "robot": form.robot, "task": form.task}
     try:
-        kept = deployments.write_draft(**given, parts=form.tables)
+        stored = deployments.write_draft(**values, parts=form.tables)
     except EvaError as fault:
         return _steps(request, status=fault.status, draft_fault=str(fault), draft=form)
-    station_registered(name=name, robot=form.robot, deployment=str(kept.path), simulated=False)
+    station_registered(name=name, robot=form.robot, deployment=str(stored.path), simulated=False)
     return _to(name)
 
 
@@ -140,8 +140,8 @@ def check_draft(request: HttpRequest, name: str) -> HttpResponse:
 def deployment(request: HttpRequest, name: str) -> HttpResponse:
     """Return the deployment file as a download."""
     require_role(request.user, Role.ADMIN)
-    found = _kept(name)
-    return FileResponse(found.path.open("rb"), as_attachment=True, filename=found.path.name)
+    stored = _kept(name)
+    return FileResponse(stored.path.open("rb"), as_attachment=True, filename=stored.path.name)
 
 
 @require_POST
@@ -180,12 +180,12 @@ def cameras(request: HttpRequest, name: str) -> HttpResponse:
     """Confirm that each camera has its right name, or rename exchanged cameras in the deployment."""
     require_role(request.user, Role.ADMIN)
     station = station_get(name=name)
-    shown = {key: request.POST.get(f"shows.{key}", key) for key in cameras_of(station)}
+    chosen = {key: request.POST.get(f"shows.{key}", key) for key in cameras_of(station)}
     try:
-        if all(key == right for key, right in shown.items()):
+        if all(key == right for key, right in chosen.items()):
             confirm_cameras(user=request.user, station=station, first=True)
         else:
-            deployments.cameras_exchanged(name=name, shown=shown)
+            deployments.cameras_exchanged(name=name, shown=chosen)
             messages.success(request, f"the names are exchanged: start {name} anew, then look again")
     except EvaError as fault:
         return _steps(request, name, status=fault.status, fault=str(fault))
@@ -205,14 +205,14 @@ def _walk(request: HttpRequest, name: str = "") -> Walk:
 
 
 def _steps(request: HttpRequest, name: str = "", *, status: int = 200, **more: Any) -> HttpResponse:
-    found = _walk(request, name)
+    walk = _walk(request, name)
     context = {
-        "walk": found,
+        "walk": walk,
         "fresh": "new" in request.GET or "simulated_name" in more or "draft" in more,
         "robots": robots.robot_names(),
         "lab_runs": deployments.lab_runs(),
         "scenes": first_steps.scenes_address(),
-        "command": deployments.command_of(found.kept.path) if found.kept else "",
+        "command": deployments.command_of(walk.kept.path) if walk.kept else "",
         **more,
     }
     return render(request, "lab/first_steps.html", context, status=status)
@@ -223,11 +223,11 @@ def _to(name: str) -> HttpResponse:
 
 
 def _kept(name: str) -> deployments.StoredDeployment:
-    found = deployments.stored_deployment(name)
-    if found is None:
-        known = ", ".join(one.name for one in deployments.stored_deployments()) or "none yet"
-        raise NotFound(f"{name!r:.80} has no deployment in the data folder; there are: {known}")
-    return found
+    stored = deployments.stored_deployment(name)
+    if stored is None:
+        names = ", ".join(row.name for row in deployments.stored_deployments()) or "none yet"
+        raise NotFound(f"{name!r:.80} has no deployment in the data folder; there are: {names}")
+    return stored
 
 
 # --- the machine ---------------------------------------------------------------------------------------------
@@ -250,9 +250,9 @@ def diagnosis(request: HttpRequest) -> HttpResponse:
     if request.method == "POST":
         services.bundle_ask(user=request.user)
         return redirect("diagnosis")
-    job, made = services.bundle_job(user=request.user), services.bundles(user=request.user)
+    job, bundles = services.bundle_job(user=request.user), services.bundles(user=request.user)
     passing = job is not None and job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
-    context = {"job": job, "bundles": made, "passing": passing, "lacks": waiting_for(job) if job else ""}
+    context = {"job": job, "bundles": bundles, "passing": passing, "lacks": waiting_for(job) if job else ""}
     fragment = request.headers.get("HX-Request")
     answer = render(request, f"lab/{'bundles' if fragment else 'diagnosis'}.html", context)
     if fragment and not passing:

@@ -69,8 +69,8 @@ class PlanForm(forms.ModelForm):
     def clean_look_after(self) -> list[int]:
         """Return the numbers of pairs; [] for an empty field: then there is a look after every pair."""
         try:
-            given = self.cleaned_data["look_after"]
-            return [] if given in self.fields["look_after"].empty_values else look_schedule(given)
+            value = self.cleaned_data["look_after"]
+            return [] if value in self.fields["look_after"].empty_values else look_schedule(value)
         except EvaError as error:
             raise forms.ValidationError(str(error)) from None
 
@@ -102,11 +102,11 @@ class FileForm(forms.Form):
 
     def clean_file(self) -> tuple[str, dict[str, bytes]]:
         """Return the text and the pictures of the file."""
-        given = self.cleaned_data["file"]
-        if given.size > LARGEST:
-            raise forms.ValidationError(f"{given.size} bytes; allowed: {LARGEST}")
+        upload = self.cleaned_data["file"]
+        if upload.size > LARGEST:
+            raise forms.ValidationError(f"{upload.size} bytes; allowed: {LARGEST}")
         try:
-            return unpacked(given.read())
+            return unpacked(upload.read())
         except EvaError as error:
             raise forms.ValidationError(str(error)) from None
 
@@ -178,8 +178,8 @@ class PlanAdmin(admin.ModelAdmin):
     @admin.display(description="positions")
     def conditions(self, plan: Plan) -> SafeString:
         """Return the positions, one line per scene."""
-        found = plan.positions.select_related("scene").order_by("scene__title", "number")
-        scenes = groupby(found, key=lambda position: position.scene.title)
+        rows = plan.positions.select_related("scene").order_by("scene__title", "number")
+        scenes = groupby(rows, key=lambda position: position.scene.title)
         lines = [(scene, "; ".join(map(str, positions))) for scene, positions in scenes]
         return format_html_join(mark_safe("<br>"), "{}: {}", lines) or mark_safe("–")
 

@@ -88,40 +88,42 @@ def allocate_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     _check(plan, user, station)
     require_none_open(station)  # before evaluating the design, so that the message reveals nothing about it
     with transaction.atomic():  # committed even if no trial is handed out
-        held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
-        lapse_void_requests(Trial.objects.filter(handout__plan=held), user=user)
+        locked = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
+        lapse_void_requests(Trial.objects.filter(handout__plan=locked), user=user)
     end_plan_if_decided(user=user, plan=plan, asked=True)
     return _allocate(user, station, plan)
 
 
 @transaction.atomic
 def _allocate(user: User, station: Station, plan: Plan) -> Handout:
-    held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
-    _check(held, user, station)
-    _check_goes_on(held)
-    slot, before = _next(held, station)
-    require_scored_first(held, before)
-    _check_unchanged(held, slot)
+    locked = (
+        Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
+    )
+    _check(locked, user, station)
+    _check_goes_on(locked)
+    slot, before = _next(locked, station)
+    require_scored_first(locked, before)
+    _check_unchanged(locked, slot)
     if slot.station_id is None:
-        held.slots.filter(block=slot.block).update(station=station)
-    number = (held.handouts.aggregate(last=Max("number"))["last"] or 0) + 1
+        locked.slots.filter(block=slot.block).update(station=station)
+    number = (locked.handouts.aggregate(last=Max("number"))["last"] or 0) + 1
     trial = create_trial(
         user=user,
         station=station,
-        evaluation=held.evaluation,
+        evaluation=locked.evaluation,
         scene=slot.scene,
         position=slot.position,
         checkpoint=slot.checkpoint,
         number=slot.repetition,
         attempt=before.attempt + 1 if before else 1,
-        strategy=(held.document or {}).get("strategy"),
+        strategy=(locked.document or {}).get("strategy"),
     )
     return Handout.objects.create(
-        plan=held,
+        plan=locked,
         number=number,
         slot=slot,
         trial=trial,
-        code=blinding.draw_codes(bytes(held.key or b""), number)[-1],
+        code=blinding.draw_codes(bytes(locked.key or b""), number)[-1],
         reason=_repeat_reason(before) if before else "",
     )
 
@@ -133,23 +135,26 @@ def release_slots(*, user: User, plan: Plan, station: Station, reason: str) -> i
     Returns: Their number.
     """
     require_role(user, Role.OPERATOR)
-    held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
-    mine = _with_newest(held.slots.filter(station=station))
+    locked = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
+    mine = _with_newest(locked.slots.filter(station=station))
     idle = [slot.pk for slot in mine if slot.newest is None or slot.newest in lifecycle.REPEATABLE_STATES]
     freed = Slot.objects.filter(pk__in=idle).update(station=None)
     if freed:
         PlanEvent.objects.create(
-            plan=held, by=user, what="given back", text=f"{freed} trials of {station.name}: {reason.strip()}"
+            plan=locked,
+            by=user,
+            what="given back",
+            text=f"{freed} trials of {station.name}: {reason.strip()}",
         )
     return freed
 
 
 def _check(plan: Plan, user: User, station: Station) -> None:
     if plan.state != PlanState.FROZEN:
-        why = visible_close_reason(plan, sealed=True)
+        reason = visible_close_reason(plan, sealed=True)
         raise Conflict(
-            _HAS_ENDED(plan=plan, why=why)
-            if why
+            _HAS_ENDED(plan=plan, why=reason)
+            if reason
             else _NO_TRIAL_HANDED_OUT(plan=plan, state=plan.get_state_display())
         )
     if plan.sealed and has_looked_at_the_same(plan, user):
@@ -162,8 +167,8 @@ def _check(plan: Plan, user: User, station: Station) -> None:
 def _check_goes_on(plan: Plan) -> None:
     waits = open_void_requests(Trial.objects.filter(handout__plan=plan)).order_by("pk").first()
     ended = end_at_request(plan) or (crossed_while_waiting(plan, waits.at) if waits else "")
-    if not ended and (found := findings_of(plan)) is not None and found.ended == "boundary":
-        ended = end_reason(plan, found)  # crossed since this request began
+    if not ended and (result := findings_of(plan)) is not None and result.ended == "boundary":
+        ended = end_reason(plan, result)  # crossed since this request began
     if ended:
         then = f"the void of trial {waits.trial_id} is answered" if waits else "its last trial is scored"
         raise Conflict(_HAS_ENDED_CLOSED_ONCE(plan=plan, ended_because=ended, then=then))
@@ -208,8 +213,8 @@ def _newest_trial(slot: Slot) -> Trial | None:
 
 
 def _repeat_reason(before: Trial) -> str:
-    said = f": {before.reason}" if before.reason else ""
-    return f"attempt {before.attempt} was {TrialStatus(before.status).label}{said}"
+    text = f": {before.reason}" if before.reason else ""
+    return f"attempt {before.attempt} was {TrialStatus(before.status).label}{text}"
 
 
 def _check_unchanged(plan: Plan, slot: Slot) -> None:

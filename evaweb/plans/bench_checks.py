@@ -108,22 +108,22 @@ def confirm_cameras(*, user: User, station: Station, first: bool = False) -> Cam
     """
     require_role(user, Role.OPERATOR)
     cameras = cameras_of(station)
-    known = references(station=station, position=None)
-    missing = [camera for camera in cameras if camera not in known]
+    by_camera = references(station=station, position=None)
+    missing = [camera for camera in cameras if camera not in by_camera]
     if missing and not first:
         raise Conflict(_NO_REFERENCE_PICTURE_YET_LOOK(missing=", ".join(missing)))
-    seen = {}
+    views = {}
     for camera, jpeg in image_store.current_images(station, cameras).items():
         name = image_store.store_image(jpeg)
-        reference = known.get(camera) or Reference.objects.create(
+        reference = by_camera.get(camera) or Reference.objects.create(
             station=station, camera=camera, picture=name, by=user
         )
-        seen[camera] = {
+        views[camera] = {
             "picture": name,
             "reference": reference.picture,
             "match": image_store.image_match(image_store.load_image(reference.picture), jpeg),
         }
-    return CameraCheck.objects.create(station=station, boot=station.boot, seen=seen, by=user)
+    return CameraCheck.objects.create(station=station, boot=station.boot, seen=views, by=user)
 
 
 # --- references ----------------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ def record_references(*, user: User, station: Station, position: Position | None
     uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
-    found = image_store.current_images(station, cameras_of(station))
+    images = image_store.current_images(station, cameras_of(station))
     Station.objects.select_for_update().get(
         pk=station.pk
     )  # serializes with `save_regions`, which needs the newest reference
@@ -159,7 +159,7 @@ def record_references(*, user: User, station: Station, position: Position | None
             regions=before[camera].regions if camera in before else [],
             by=user,
         )
-        for camera, jpeg in found.items()
+        for camera, jpeg in images.items()
     ]
 
 
@@ -170,7 +170,7 @@ def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
     Raises: Conflict if there is a newer one, or a running plan with a least match has used this camera's reference.
     """
     require_role(user, Role.OPERATOR)
-    found = region_matching.regions_of(drawn)
+    regions = region_matching.regions_of(drawn)
     position = reference.position
     if position is None:
         raise EvaError(_THIS_REFERENCE_SAYS_WHAT_CAMERA)
@@ -178,14 +178,14 @@ def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
     newest = references(station=station, position=position)[reference.camera]
     if newest.pk != reference.pk:
         raise Conflict(_HAS_NEWER_REFERENCE_HERE_BY(camera=reference.camera, user=newest.by.get_username()))
-    region_matching.check_sizes(found, image_store.load_image(reference.picture))
+    region_matching.check_sizes(regions, image_store.load_image(reference.picture))
     _require_unjudged(reference)
     return Reference.objects.create(
         station=station,
         position=position,
         camera=reference.camera,
         picture=reference.picture,
-        regions=[region.model_dump() for region in found],
+        regions=[region.model_dump() for region in regions],
         by=user,
     )
 
@@ -241,16 +241,18 @@ def current_matches(*, trial: Trial) -> list[CameraMatch]:
     """
     if trial.status != TrialStatus.PREPARED:
         return []
-    known = references(station=trial.station, position=trial.position)
-    return _compare_cameras(trial, [camera for camera in cameras_of(trial.station) if camera in known], 1.0)
+    by_camera = references(station=trial.station, position=trial.position)
+    return _compare_cameras(
+        trial, [camera for camera in cameras_of(trial.station) if camera in by_camera], 1.0
+    )
 
 
 def _compare_cameras(trial: Trial, cameras: Sequence[str], patience_s: float) -> list[CameraMatch]:
     if trial.status != TrialStatus.PREPARED:
         raise Conflict(_TRIAL_BENCH_LOOKED_AT_BEFORE(trial=trial.pk, status=trial.get_status_display()))
-    known = references(station=trial.station, position=trial.position)
-    found = image_store.current_images(trial.station, cameras, patience_s)
-    return [_seen(camera, jpeg, known.get(camera)) for camera, jpeg in found.items()]
+    by_camera = references(station=trial.station, position=trial.position)
+    images = image_store.current_images(trial.station, cameras, patience_s)
+    return [_seen(camera, jpeg, by_camera.get(camera)) for camera, jpeg in images.items()]
 
 
 def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> CameraMatch:
@@ -268,35 +270,35 @@ def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achie
     Raises: Conflict if a match is below the plan's least one and `override` has no reason.
     """
     require_role(user, Role.OPERATOR)
-    why = clean_text("override", override, LONGEST_NOTE)
-    seen = _compare_cameras(trial, cameras_of(trial.station), 3.0)
-    _require_match(trial, seen, why)
+    reason = clean_text("override", override, LONGEST_NOTE)
+    matches = _compare_cameras(trial, cameras_of(trial.station), 3.0)
+    _require_match(trial, matches, reason)
     return [
         Achieved.objects.create(
             trial=trial,
-            camera=one.camera,
-            picture=image_store.store_image(one.jpeg),
-            reference=one.reference,
-            match=one.match,
-            regions=one.regions,
-            override=why,
+            camera=match.camera,
+            picture=image_store.store_image(match.jpeg),
+            reference=match.reference,
+            match=match.match,
+            regions=match.regions,
+            override=reason,
             by=user,
         )
-        for one in seen
+        for match in matches
     ]
 
 
-def _require_match(trial: Trial, seen: Sequence[CameraMatch], why: str) -> None:
+def _require_match(trial: Trial, matches: Sequence[CameraMatch], reason: str) -> None:
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     least = handout.plan.match_gate if handout else None
-    if least is None or why:
+    if least is None or reason:
         return
-    low = sorted(one.worst[1] for one in seen if one.worst is not None and one.worst[0] < least)
+    low = sorted(match.worst[1] for match in matches if match.worst is not None and match.worst[0] < least)
     if low:
         raise Conflict(_BENCH_NOT_AS_REFERENCE_SHOWS(low="; ".join(low), least=least))
 
 
-def _check_before(what: str, trial: Trial, user: Any) -> None:
+def _check_before(action: str, trial: Trial, user: Any) -> None:
     """Check an action on a plan's trial (see `register_check`).
 
     Within a transaction the plan is locked until its end, so that it cannot be revealed between check and action.
@@ -307,32 +309,32 @@ def _check_before(what: str, trial: Trial, user: Any) -> None:
     handout = rows.filter(trial=trial).first()
     if handout is None:
         return
-    if what == "run":
+    if action == "run":
         newest = Achieved.objects.filter(trial=trial).last()
         if newest is None or timezone.now() - newest.at > LOOK_HOLDS:
             record_layout(user=user, trial=trial, override=newest.override if newest else "")
-    if what.startswith("void") and handout.plan.state == PlanState.REVEALED:
+    if action.startswith("void") and handout.plan.state == PlanState.REVEALED:
         raise EvaError(_REVEALED_WHAT_VOIDED_NOW_WOULD(plan=handout.plan))
-    if what == "voided" and handout.trial.status == TrialStatus.SCORED:
+    if action == "voided" and handout.trial.status == TrialStatus.SCORED:
         if handout.plan.state == PlanState.CLOSED:
             raise Conflict(_CLOSED_TRIAL_COULD_NOT_REPEATED(plan=handout.plan, trial=trial.pk))
         if end_at_request(handout.plan):
             raise Conflict(_ENDED_TRIAL_COUNTS(plan=handout.plan, trial=trial.pk))
-    if what == "void agreed" and handout.plan.state == PlanState.CLOSED and not _repeated(handout):
+    if action == "void agreed" and handout.plan.state == PlanState.CLOSED and not _repeated(handout):
         raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))
-    if what in ("run", "judged"):
+    if action in ("run", "judged"):
         require_scene(handout.plan, trial.scene)
-    if what == "prepared":  # runs before set-up and before run
+    if action == "prepared":  # runs before set-up and before run
         require_checkpoints(handout.plan)
-    judged = what in ("scored", "voided", "void answered")
+    judged = action in ("scored", "voided", "void answered")
     if judged and handout.plan.sealed and has_looked_at_the_same(handout.plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_OPERATOR(plan=handout.plan))
 
 
 def _repeated(handout: Handout) -> bool:
     """Return True if another attempt at the same slot counts."""
-    others = Handout.objects.filter(plan=handout.plan_id, slot=handout.slot_id).exclude(pk=handout.pk)
-    return others.filter(trial__status=TrialStatus.SCORED).exists()
+    repetitions = Handout.objects.filter(plan=handout.plan_id, slot=handout.slot_id).exclude(pk=handout.pk)
+    return repetitions.filter(trial__status=TrialStatus.SCORED).exists()
 
 
 def _of_two(trial: Trial) -> bool:

@@ -38,16 +38,16 @@ def is_sealed_for(plan: Plan, user: Any) -> bool:
 @transaction.atomic
 def record_unblinding(plan: Plan, user: Any) -> None:
     """Record that the user unblinds the plan. Raises: NotAllowed if they may not."""
-    held = Plan.objects.select_for_update(of=("self",)).select_related("owner").get(pk=plan.pk)
-    if not held.sealed:
+    locked = Plan.objects.select_for_update(of=("self",)).select_related("owner").get(pk=plan.pk)
+    if not locked.sealed:
         return
-    why = _why_not(held, user)
-    if why:
-        raise NotAllowed(why)
-    _, made = Look.objects.get_or_create(plan=held, user=user)
-    if made:
+    reason = _why_not(locked, user)
+    if reason:
+        raise NotAllowed(reason)
+    _, created = Look.objects.get_or_create(plan=locked, user=user)
+    if created:
         PlanEvent.objects.create(
-            plan=held, by=user, what="looked", text="behind the blind, before the reveal"
+            plan=locked, by=user, what="looked", text="behind the blind, before the reveal"
         )
 
 
@@ -58,11 +58,11 @@ def is_unblinded(plan: Plan, user: Any) -> bool:
 
 def has_looked_at_the_same(plan: Plan, user: Any) -> bool:
     """Return True if this user has unblinded any version of the plan, or a plan with the same checkpoints."""
-    looks = Look.objects.filter(user=user)
-    if not looks.exists():  # true for most users, and checked at every score
+    unblindings = Look.objects.filter(user=user)
+    if not unblindings.exists():  # true for most users, and checked at every score
         return False
-    beside = overlapping_plans(plan).values("pk")
-    return looks.filter(Q(plan__name=plan.name) | Q(plan__in=beside)).exists()
+    overlapping = overlapping_plans(plan).values("pk")
+    return unblindings.filter(Q(plan__name=plan.name) | Q(plan__in=overlapping)).exists()
 
 
 def can_unblind(plan: Plan, user: Any) -> bool:
@@ -76,15 +76,15 @@ def visibility_for(user: Any) -> Visibility:
     if user.pk is not None:
         plans = plans.exclude(looks__user=user)
     # Include the frozen names: recordings keep the name that a checkpoint had.
-    found = list(plans.values_list("pk", "title", "version", "document__checkpoints"))
+    blind_rows = list(plans.values_list("pk", "title", "version", "document__checkpoints"))
     lost = list(_lost_plans().values_list("pk", "name", "version"))
-    if not (found or lost):
+    if not (blind_rows or lost):
         return FULL_VISIBILITY
-    keys = [pk for pk, *_ in found]
+    keys = [pk for pk, *_ in blind_rows]
     orphans = Trial.objects.filter(evaluation__in=[pk for pk, *_ in lost]).order_by()
     of_plans = Checkpoint.objects.filter(Q(plan__in=keys) | Q(pk__in=orphans.values("checkpoint")))
     hidden = dict(of_plans.values_list("pk", "name"))
-    frozen = {row["name"] for *_, rows in found for row in rows or ()}
+    frozen = {row["name"] for *_, rows in blind_rows for row in rows or ()}
     handed = [
         *orphans.values_list("station__name", "status").distinct(),
         *Handout.objects.filter(plan__in=keys)
@@ -98,8 +98,8 @@ def visibility_for(user: Any) -> Visibility:
         stations=frozenset(station for station, _ in handed),
         keys=frozenset(keys),
         busy_stations=frozenset(station for station, status in handed if status in UNFINISHED),
-        plans=f"{plan_titles(f'{title} v{version}' for _, title, version, *_ in (*found, *lost))} is blind until it is "
-        "revealed",
+        plans=f"{plan_titles(f'{title} v{version}' for _, title, version, *_ in (*blind_rows, *lost))} is blind "
+        "until it is revealed",
         user=user.pk,
     )
 

@@ -30,10 +30,10 @@ def draw_codes(key: bytes, count: int) -> list[str]:
     """Return `count` distinct codes in the order of the trials, independent of their checkpoints."""
     if count > len(_LETTERS) ** _LENGTH // 100:
         raise EvaError(_CODES_ALLOWED(count=count, count_2=len(_LETTERS) ** _LENGTH // 100))
-    chance, found = SeededDraws(key, "codes"), dict[str, None]()
-    while len(found) < count:
-        found["".join(_LETTERS[chance.below(len(_LETTERS))] for _ in range(_LENGTH))] = None
-    return list(found)
+    chance, codes = SeededDraws(key, "codes"), dict[str, None]()
+    while len(codes) < count:
+        codes["".join(_LETTERS[chance.below(len(_LETTERS))] for _ in range(_LENGTH))] = None
+    return list(codes)
 
 
 def make_commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:

@@ -86,21 +86,21 @@ def declared_failures(plan: Plan) -> dict[int, str]:
     }
 
 
-def _judged(what: str, trial: Trial, user: Any) -> None:
-    if what not in ("voided", "judged success", "judged failure"):
+def _judged(action: str, trial: Trial, user: Any) -> None:
+    if action not in ("voided", "judged success", "judged failure"):
         return
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     end = ended_by(trial)
     if handout is None or not end:
         return
     counts = getattr(handout.plan, end)
-    if what == "voided":  # a single operator could void an unscored failure to have it repeated
+    if action == "voided":  # a single operator could void an unscored failure to have it repeated
         if trial.verdict_id is None and fails_by(handout.plan, trial):
             raise Conflict(_SCORE_IT_FIRST(trial=trial.pk, what=ENDS[end], plan=handout.plan))
         return
     if counts == CountsAs.REPEATED:
         raise Conflict(_REPEATED(trial=trial.pk, what=ENDS[end], plan=handout.plan))
-    if counts == CountsAs.FAILURE and what == "judged success":
+    if counts == CountsAs.FAILURE and action == "judged success":
         raise Conflict(_FAILURE(trial=trial.pk, what=ENDS[end], plan=handout.plan))
 
 

@@ -27,8 +27,8 @@ def cover_of(job: Job, sight: Visibility) -> Cover:
     if sight.hides_nothing:
         return Cover.NOTHING
     if "uuid" in job.args:
-        found = _episode(job.args["uuid"])
-        if found is not None and sight.hides_episode(found):
+        episode = _episode(job.args["uuid"])
+        if episode is not None and sight.hides_episode(episode):
             return Cover.ALL
         return Cover.WORDS if sight.named_in(f"{job.progress} {job.error}") else Cover.NOTHING
     return Cover.ALL if job.args.get("plan") in sight.keys else Cover.WORDS

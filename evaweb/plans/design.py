@@ -82,21 +82,21 @@ def draft_design(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) ->
 
     `counts`: for random order, the numbers of trials of both checkpoints after each block.
     """
-    said = _design_arguments(plan)
-    if said is None:
+    arguments = _design_arguments(plan)
+    if arguments is None:
         return None
     try:
-        return design(**said, counts=counts, holm=True)
+        return design(**arguments, counts=counts, holm=True)
     except StatisticsError as error:
         raise EvaError(str(error)) from None
 
 
 def check_drafted(plan: Plan) -> None:
     """Raise EvaError if the draft's design is invalid; cheap, as it computes no boundary."""
-    said = _design_arguments(plan)
+    arguments = _design_arguments(plan)
     try:
-        if said is not None:
-            check_design(**said, paired=plan.allocation == Allocation.PAIRED)
+        if arguments is not None:
+            check_design(**arguments, paired=plan.allocation == Allocation.PAIRED)
     except StatisticsError as error:
         raise EvaError(str(error)) from None
 
@@ -129,19 +129,19 @@ def frozen_design(document: Mapping[str, Any]) -> Design | None:
     if not comparisons:
         return None
     before = {"outcome": SUCCESS, "margin": None, "boundary": None, "drops": False, "counts": None}
-    said = {**before, **document["stopping"]}
+    stopping = {**before, **document["stopping"]}
     positions = sum(len(scene["positions"]) for scene in document["scenes"])
-    rows, alpha, margin = said["boundary"], said["alpha"], said["margin"]
+    rows, alpha, margin = stopping["boundary"], stopping["alpha"], stopping["margin"]
     return Design(
-        said["rule"],
+        stopping["rule"],
         positions * document["repetitions"],
         alpha,
         margin,
-        said["outcome"],
+        stopping["outcome"],
         boundary_from_table(rows, alpha / len(comparisons), margin) if rows else None,
         _by_number(comparisons),
-        said["drops"],
-        tuple((first, second) for first, second in said["counts"]) if said["counts"] else None,
+        stopping["drops"],
+        tuple((first, second) for first, second in stopping["counts"]) if stopping["counts"] else None,
         document.get("format", 1) >= _SINCE_HOLM,
     )
 
@@ -194,20 +194,20 @@ class Attempt:
 def attempts_of(plan: Plan) -> list[Attempt]:
     """Return the attempts of a frozen plan's comparisons in the order of handout; one query."""
     document = plan.document or {}
-    found = frozen_design(document)
-    if found is None:
+    frozen = frozen_design(document)
+    if frozen is None:
         return []
-    value = "success" if found.outcome == SUCCESS else "score"
-    given = Score.objects.filter(trial=OuterRef("trial"))
+    value = "success" if frozen.outcome == SUCCESS else "score"
+    scores = Score.objects.filter(trial=OuterRef("trial"))
     if plan.stored_at:  # later scores do not belong to the evaluation
-        given = given.filter(scored_at__lte=plan.stored_at)
-    first = given.order_by("pk").values(value)[:1]
+        scores = scores.filter(scored_at__lte=plan.stored_at)
+    first = scores.order_by("pk").values(value)[:1]
     rows = plan.handouts.filter(
         trial__status__in=(*SCORED_STATES, TrialStatus.INTERRUPTED),
         slot__checkpoint__name__in=arms_of(compared(document)),
     ).order_by("number")
     named = ("trial_id", "trial__attempt", "trial__operator__username", "trial__station__name")
-    told = (
+    fields = (
         "slot__block",
         "slot__index",
         "slot__checkpoint__name",
@@ -222,10 +222,10 @@ def attempts_of(plan: Plan) -> list[Attempt]:
             status == TrialStatus.SCORED,
             None if outcome is None else float(outcome),
             None if before is None else float(before),
-            *who,
+            *names,
         )
-        for block, slot, name, status, outcome, before, *who in rows.values_list(
-            *told, Subquery(first), *named
+        for block, slot, name, status, outcome, before, *names in rows.values_list(
+            *fields, Subquery(first), *named
         )
     ]
 
@@ -233,10 +233,10 @@ def attempts_of(plan: Plan) -> list[Attempt]:
 def current_pairs(plan: Plan) -> Tried:
     """Return the current outcomes of a frozen plan by block; empty without a comparison. Takes one query."""
     document = plan.document or {}
-    found = frozen_design(document) if document else None
-    if found is None:
+    frozen = frozen_design(document) if document else None
+    if frozen is None:
         return Tried([], [], [])
-    return blocks_of(found, arms_of(compared(document)), attempts_of(plan))
+    return blocks_of(frozen, arms_of(compared(document)), attempts_of(plan))
 
 
 def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -> Tried:
@@ -244,22 +244,22 @@ def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -
     counted: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     at_first: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     thrown: set[int] = set()
-    for each in attempts:
-        arm = arms.index(each.checkpoint)
-        if each.first is None:
-            thrown.add(each.slot)
+    for attempt in attempts:
+        arm = arms.index(attempt.checkpoint)
+        if attempt.first is None:
+            thrown.add(attempt.slot)
         else:
-            at_first[each.block].setdefault(each.slot, (arm, each.first))
-        if each.counts and each.outcome is not None:
-            counted[each.block][each.slot] = (arm, each.outcome)
+            at_first[attempt.block].setdefault(attempt.slot, (arm, attempt.first))
+        if attempt.counts and attempt.outcome is not None:
+            counted[attempt.block][attempt.slot] = (arm, attempt.outcome)
 
     def used(rows: Mapping[int, Mapping[int, tuple[int, float]]]) -> list[Block]:
         whole = [tuple(trial for _, trial in sorted(rows.get(at, {}).items())) for at in range(found.blocks)]
-        return list(whole[: max(one.blocks for one in findings(found, whole).each)])
+        return list(whole[: max(conclusion.blocks for conclusion in findings(found, whole).each)])
 
     now = used(counted)
-    again = [[slot in thrown for slot in sorted(counted.get(at, {}))] for at in range(len(now))]
-    return Tried(now, used(at_first), again)
+    retried = [[slot in thrown for slot in sorted(counted.get(at, {}))] for at in range(len(now))]
+    return Tried(now, used(at_first), retried)
 
 
 def stored_blocks(plan: Plan) -> list[Block] | None:
@@ -270,7 +270,7 @@ def stored_blocks(plan: Plan) -> list[Block] | None:
 def blocks_of_record(kept: Mapping[str, Any]) -> list[Block]:
     """Return the blocks of a `reveal_record`; an old record, which stored pairs, is converted to blocks."""
     if "blocks" not in kept:
-        return in_blocks([(one, other) for one, other in kept["pairs"]])
+        return in_blocks([(first, second) for first, second in kept["pairs"]])
     return [tuple((arm, value) for arm, value in block) for block in kept["blocks"]]
 
 
@@ -284,8 +284,8 @@ def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
 
 def blocks_that_count(plan: Plan) -> list[Block]:
     """Return the blocks of the reveal if there was one, else the current ones."""
-    kept = stored_blocks(plan)
-    return current_pairs(plan).counted if kept is None else kept
+    stored = stored_blocks(plan)
+    return current_pairs(plan).counted if stored is None else stored
 
 
 def findings_of(plan: Plan) -> Findings | None:
@@ -293,10 +293,10 @@ def findings_of(plan: Plan) -> Findings | None:
 
     Those are the blocks of the reveal if there was one, else the current ones.
     """
-    found = frozen_design(plan.document) if plan.document else None
-    if found is None:
+    frozen = frozen_design(plan.document) if plan.document else None
+    if frozen is None:
         return None
-    return findings(found, blocks_that_count(plan))
+    return findings(frozen, blocks_that_count(plan))
 
 
 def dropped_of(plan: Plan) -> dict[str, int]:
@@ -305,17 +305,22 @@ def dropped_of(plan: Plan) -> dict[str, int]:
     A trial that is being repeated counts with its score until its repetition is scored. If it counted as missing, a
     drop could be undone, the omitted trials would come next, and the operator would recognise their checkpoint.
     """
-    found = frozen_design(plan.document) if plan.document else None
-    if found is None or not found.drops:
+    frozen = frozen_design(plan.document) if plan.document else None
+    if frozen is None or not frozen.drops:
         return {}
     arms = arms_of(compared(plan.document or {}))
     attempts = attempts_of(plan)
-    made = {each.slot for each in attempts if each.counts}
-    waiting = [replace(each, counts=each.slot not in made) for each in attempts if not each.counts]
-    said = findings(
-        found, blocks_of(found, arms, [*waiting, *(each for each in attempts if each.counts)]).counted
+    counted_slots = {attempt.slot for attempt in attempts if attempt.counts}
+    waiting = [
+        replace(attempt, counts=attempt.slot not in counted_slots)
+        for attempt in attempts
+        if not attempt.counts
+    ]
+    result = findings(
+        frozen,
+        blocks_of(frozen, arms, [*waiting, *(attempt for attempt in attempts if attempt.counts)]).counted,
     )
-    return {arms[arm]: at for arm, at in said.dropped.items() if said.at is None or at < said.at}
+    return {arms[arm]: at for arm, at in result.dropped.items() if result.at is None or at < result.at}
 
 
 def end_reason(plan: Plan, found: Findings) -> str:
@@ -329,8 +334,8 @@ def end_at_request(plan: Plan) -> str:
 
     The end is found when a trial is requested, or at the last trial.
     """
-    told = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
-    return told or ""
+    text = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
+    return text or ""
 
 
 def crossed_while_waiting(plan: Plan, since: datetime) -> str:
@@ -338,8 +343,8 @@ def crossed_while_waiting(plan: Plan, since: datetime) -> str:
 
     "" if it would not have ended.
     """
-    told = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
-    return told or ""
+    text = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
+    return text or ""
 
 
 def visible_close_reason(plan: Plan, sealed: bool) -> str:
@@ -349,7 +354,7 @@ def visible_close_reason(plan: Plan, sealed: bool) -> str:
     with them.
     """
     if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
-        own = any(plan.closed_because.startswith(f"{words}, after ") for words in ENDED.values())
+        own = any(plan.closed_because.startswith(f"{text}, after ") for text in ENDED.values())
     else:
         own = plan.closed_because == end_at_request(plan)
     return plan.closed_because if own or not sealed else ""
@@ -371,17 +376,17 @@ def reveal_record(plan: Plan) -> dict[str, Any] | None:
     document = plan.document or {}
     if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:
         return None
-    kept = counted_now(plan)
-    for told in _told_of:
-        kept |= told(plan)
-    return {**kept, "digest": digest({"plan": plan.digest, **kept}), "at": timezone.now().isoformat()}
+    record = counted_now(plan)
+    for part_of in _told_of:
+        record |= part_of(plan)
+    return {**record, "digest": digest({"plan": plan.digest, **record}), "at": timezone.now().isoformat()}
 
 
 def recorded_so_far(plan: Plan) -> Hashable:
     """Return a fingerprint that changes whenever a trial, score, correction or void is added."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
-    found = trials.aggregate(n=Count("pk"), changed=Max("changed_at"), scores=Count("scores", distinct=True))
-    return tuple(found.values())
+    counts = trials.aggregate(n=Count("pk"), changed=Max("changed_at"), scores=Count("scores", distinct=True))
+    return tuple(counts.values())
 
 
 def counted_now(plan: Plan) -> dict[str, Any]:
@@ -400,11 +405,11 @@ def _sums(plan: Plan) -> list[dict[str, Any]]:
     The order is that of the plan's document.
     """
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by("number")
-    found: dict[str, list[tuple[bool, float]]] = defaultdict(list)
+    by_checkpoint: dict[str, list[tuple[bool, float]]] = defaultdict(list)
     for name, success, score in rows.values_list(
         "slot__checkpoint__name", "trial__verdict__success", "trial__verdict__score"
     ):
-        found[name].append((success, score))
+        by_checkpoint[name].append((success, score))
     return [
         {
             "checkpoint": row["name"],
@@ -413,7 +418,7 @@ def _sums(plan: Plan) -> list[dict[str, Any]]:
             "score": math.fsum(score for _, score in scored) / len(scored) if scored else None,
         }
         for row in (plan.document or {})["checkpoints"]
-        for scored in (found[row["name"]],)
+        for scored in (by_checkpoint[row["name"]],)
     ]
 
 

@@ -84,15 +84,15 @@ def _designed(plan: Plan) -> Iterator[Remark]:
 
 def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
     named = [row for row in (plan.first, plan.second) if row]
-    wanted = {Comparing.CONTROL: (1, "the first one alone"), Comparing.ALL: (0, "none by name")}
-    if plan.comparing in wanted:
-        number, words = wanted[Comparing(plan.comparing)]
+    named_counts = {Comparing.CONTROL: (1, "the first one alone"), Comparing.ALL: (0, "none by name")}
+    if plan.comparing in named_counts:
+        number, text = named_counts[Comparing(plan.comparing)]
         if number and not named:
             yield Remark("arms", "no control is chosen (first), with which each checkpoint is compared")
         elif len(named) != number or (number and plan.first is None):
-            yield Remark("arms", f"comparisons of {plan.get_comparing_display()} name {words}")
-        others = plan.checkpoints.filter(anchor=True) if plan.comparing == Comparing.ALL else ()
-        if len(chosen - {row.pk for row in others}) < 2:
+            yield Remark("arms", f"comparisons of {plan.get_comparing_display()} name {text}")
+        anchors = plan.checkpoints.filter(anchor=True) if plan.comparing == Comparing.ALL else ()
+        if len(chosen - {row.pk for row in anchors}) < 2:
             yield Remark(
                 "arms", f"comparisons of {plan.get_comparing_display()} need two checkpoints or more"
             )
@@ -101,7 +101,7 @@ def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
     for row in named:
         if row.pk not in chosen:
             yield Remark("arms", f"the comparison is about {row}, which is not one of the plan's checkpoints")
-    failing = [words for name, words in ENDS.items() if getattr(plan, name) == CountsAs.FAILURE]
+    failing = [text for name, text in ENDS.items() if getattr(plan, name) == CountsAs.FAILURE]
     if plan.outcome == PrimaryOutcome.SCORE and failing:
         yield Remark(
             "design",
@@ -114,14 +114,14 @@ def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
             "margin with comparisons of all checkpoints with each other: it asks of one whether it is not worse than "
             "another; allowed with: first and second, each checkpoint with the first",
         )
-    asked = (
+    designed = (
         plan.stopping != StoppingRule.NONE
         or plan.margin is not None
         or plan.outcome != PrimaryOutcome.SUCCESS
         or plan.allocation != Allocation.PAIRED
         or plan.drop_arms
     )
-    if asked and not planned(plan):
+    if designed and not planned(plan):
         yield Remark(
             "arms",
             "a design with looks, a margin, a score, random order or dropped checkpoints needs the comparison that it "

@@ -33,13 +33,13 @@ def read(
     if not owners:
         del form.fields["owner"]
     form.is_valid()
-    faults = {str(name): _sentence(name, said[0], given) for name, said in form.errors.items()}
+    faults = {str(name): _sentence(name, messages[0], given) for name, messages in form.errors.items()}
     return {name: _plain(value) for name, value in form.cleaned_data.items() if name != "kind"}, faults
 
 
-def _sentence(name: str, said: Any, given: QueryDict) -> str:
-    typed = given.get(name, "").strip()
-    return f"{typed!r:.40} is not saved. {said}" if typed else f"Not saved. {said}"
+def _sentence(name: str, message: Any, query: QueryDict) -> str:
+    typed = query.get(name, "").strip()
+    return f"{typed!r:.40} is not saved. {message}" if typed else f"Not saved. {message}"
 
 
 def _plain(value: Any) -> Any:
@@ -99,31 +99,31 @@ class _Draft(forms.Form):
 
     def clean_margin(self) -> float | None:
         """Convert percentage points to a fraction; None if the question is whether two differ."""
-        given = self.cleaned_data["margin"]
+        points = self.cleaned_data["margin"]
         if self.cleaned_data.get("kind") != "margin":
             return None
-        if given is None:
+        if points is None:
             raise forms.ValidationError("Say by how many points it may be worse: 0.1 to 99.9.")
-        return round(float(given) / _POINTS, 6)
+        return round(float(points) / _POINTS, 6)
 
     def clean_look_after(self) -> list[int]:
         """Return comma-separated integers; [] for a look after every pair."""
-        words = self.cleaned_data["look_after"].replace(",", " ").split()
+        numbers = self.cleaned_data["look_after"].replace(",", " ").split()
         try:
-            return look_schedule([int(word) if _is_number(word) else word for word in words])
+            return look_schedule([int(word) if _is_number(word) else word for word in numbers])
         except EvaError:
             raise forms.ValidationError("Allowed: rising numbers of pairs, such as 20, 40, 60.") from None
 
     def clean(self) -> dict[str, Any]:
         """Clear control and challenger unless they are checkpoints of the plan that its comparisons name."""
-        found = self.cleaned_data
+        values = self.cleaned_data
         named = {Comparing.ALL: (), Comparing.CONTROL: ("control",)}.get(
-            found.get("comparing"), ("control", "challenger")
+            values.get("comparing"), ("control", "challenger")
         )
-        chosen = {str(row.pk) for row in found.get("checkpoints", ())} | {HIDDEN}
+        chosen = {str(row.pk) for row in values.get("checkpoints", ())} | {HIDDEN}
         for name in ("control", "challenger"):
-            if found.get(name) not in chosen or name not in named:
-                found[name] = ""
-        if found.get("challenger") == found.get("control") or len(chosen) - 1 + self.unseen == 2:
-            found["challenger"] = ""  # with two checkpoints the challenger is implied
-        return found
+            if values.get(name) not in chosen or name not in named:
+                values[name] = ""
+        if values.get("challenger") == values.get("control") or len(chosen) - 1 + self.unseen == 2:
+            values["challenger"] = ""  # with two checkpoints the challenger is implied
+        return values

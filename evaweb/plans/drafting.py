@@ -85,9 +85,9 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
     for name in _SETS:
         getattr(plan, name).set(values[name])
     before = set(plan.checkpoints.values_list("pk", flat=True))
-    kept = before & set(hidden)
-    plan.checkpoints.set({*values["checkpoints"], *kept})
-    _compare(plan, values, {*values["checkpoints"], *kept}, roles)
+    retained = before & set(hidden)
+    plan.checkpoints.set({*values["checkpoints"], *retained})
+    _compare(plan, values, {*values["checkpoints"], *retained}, roles)
 
 
 def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None:

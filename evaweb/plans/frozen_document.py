@@ -88,16 +88,16 @@ def _design(plan: Plan, document: dict[str, Any], key: bytes) -> dict[str, Any]:
         names = next(iter(document["comparisons"]), [row["name"] for row in document["checkpoints"]])
         counts = counts_of(_units(document, key), names)
         _check_counts(counts[-1], bounded=plan.stopping in SHAPES or plan.margin is not None)
-    found = draft_design(plan, counts)
+    drafted = draft_design(plan, counts)
     return {
         "rule": plan.stopping,
         "alpha": plan.alpha,
         "drops": plan.drop_arms,
         "outcome": plan.outcome,
         "margin": plan.margin,
-        "pairs": found.blocks if found else None,
+        "pairs": drafted.blocks if drafted else None,
         "counts": [list(count) for count in counts] if counts is not None else None,
-        "boundary": boundary_table(found.boundary) if found and found.boundary else None,
+        "boundary": boundary_table(drafted.boundary) if drafted and drafted.boundary else None,
     }
 
 
@@ -105,14 +105,14 @@ class UnevenError(EvaError):
     """Error for a random order whose numbers of trials do not fit the design; another key draws another order."""
 
 
-def _check_counts(made: tuple[int, int], *, bounded: bool) -> None:
-    if min(made) == 0 or (bounded and max(made) > MOST):
+def _check_counts(counts: tuple[int, int], *, bounded: bool) -> None:
+    if min(counts) == 0 or (bounded and max(counts) > MOST):
         raise UnevenError(
             _RANDOM_ORDER_TWO_CHECKPOINTS_CAME(
-                made=made[0],
-                made_2=made[1],
+                made=counts[0],
+                made_2=counts[1],
                 most=MOST if bounded else "any number",
-                which="fewer" if bounded and min(made) else "more",
+                which="fewer" if bounded and min(counts) else "more",
             )
         )
 
@@ -151,9 +151,9 @@ def require_checkpoints(plan: Plan) -> None:
     All are checked, whichever the trial uses, and the message does not name it: otherwise deactivating one would reveal
     which checkpoint comes next.
     """
-    there = {row.name: row for row in plan.checkpoints.all()}
+    by_name = {row.name: row for row in plan.checkpoints.all()}
     for row in (plan.document or {})["checkpoints"]:
-        now = there.get(row["name"])
+        now = by_name.get(row["name"])
         if now is None:
             raise Conflict(_CHECKPOINT_RENAMED_SINCE_FROZEN(plan=plan))
         if not now.active:

@@ -52,21 +52,21 @@ _TURN_S = 0.1
 
 def current_images(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> dict[str, bytes]:
     """Return a current JPEG of each camera. Raises: Conflict, which names cameras without an image in `patience_s`."""
-    wanted = set(cameras)
-    found: dict[str, bytes] = {}
+    requested = set(cameras)
+    images: dict[str, bytes] = {}
     until = time.monotonic() + patience_s
     endpoint = connection_to(station.name).address("media", "cameras")
     with closing(Subscriber(zmq.Context.instance(), endpoint, "camera/")) as subscriber:
-        while wanted - set(found) and time.monotonic() < until:
+        while requested - set(images) and time.monotonic() < until:
             try:
-                heard = subscriber.receive(_TURN_S)
+                received = subscriber.receive(_TURN_S)
             except CodecError as error:
                 raise Conflict(f"{station.name} publishes pictures that cannot be read: {error}") from None
-            found |= {name[7:]: bytes(jpeg) for name, jpeg in heard.items() if name[7:] in wanted}
-    missing = sorted(wanted - set(found))
+            images |= {name[7:]: bytes(jpeg) for name, jpeg in received.items() if name[7:] in requested}
+    missing = sorted(requested - set(images))
     if missing:
         raise Conflict(_NO_PICTURE_FROM_WITHIN_S(missing=", ".join(missing), patience_s=patience_s))
-    return found
+    return images
 
 
 def image_match(one: bytes, other: bytes) -> float:

@@ -78,7 +78,7 @@ def reference_tables(scenes: Iterable[Scene]) -> list[dict[str, Any]]:
         "position__scene", "station"
     )
     newest = {(row.position_id, row.station_id, row.camera): row for row in rows.order_by("pk")}
-    found = [
+    tables = [
         {
             "scene": row.position.scene.name,
             "position": row.position.number,
@@ -90,7 +90,7 @@ def reference_tables(scenes: Iterable[Scene]) -> list[dict[str, Any]]:
         for row in newest.values()
         if row.position is not None
     ]
-    return sorted(found, key=lambda row: (row["scene"], row["position"], row["station"], row["camera"]))
+    return sorted(tables, key=lambda row: (row["scene"], row["position"], row["station"], row["camera"]))
 
 
 def packed(text: str, name: str, references: Iterable[Mapping[str, Any]]) -> bytes:
@@ -139,14 +139,14 @@ def _of(archive: zipfile.ZipFile) -> tuple[str, dict[str, bytes]]:
     texts = [entry for entry in entries if entry.filename.endswith(".toml") and "/" not in entry.filename]
     if len(texts) != 1:
         raise EvaError(_ARCHIVE_HAS_TOML_FILES_AT(count=len(texts)))
-    others = [entry for entry in entries if entry is not texts[0]]
-    strange = next((entry for entry in others if not _PICTURE.fullmatch(entry.filename)), None)
+    pictures = [entry for entry in entries if entry is not texts[0]]
+    strange = next((entry for entry in pictures if not _PICTURE.fullmatch(entry.filename)), None)
     if strange is not None:
         raise EvaError(_ARCHIVE_HAS_ALLOWED_ONE_TOML(filename=strange.filename))
-    if len(others) > _MOST or sum(entry.file_size for entry in entries) > LARGEST:
-        raise EvaError(_ARCHIVE_HAS_PICTURES_ALLOWED_BYTES(count=len(others), most=_MOST, largest=LARGEST))
-    found = {}
-    for entry in others:
+    if len(pictures) > _MOST or sum(entry.file_size for entry in entries) > LARGEST:
+        raise EvaError(_ARCHIVE_HAS_PICTURES_ALLOWED_BYTES(count=len(pictures), most=_MOST, largest=LARGEST))
+    jpegs = {}
+    for entry in pictures:
         jpeg = _read(archive, entry, LARGEST_PICTURE)
         name = entry.filename.removeprefix("pictures/").removesuffix(".jpg")
         if hashlib.sha256(jpeg).hexdigest() != name:
@@ -155,8 +155,8 @@ def _of(archive: zipfile.ZipFile) -> tuple[str, dict[str, bytes]]:
             image_store.image_match(jpeg, jpeg)
         except EvaError as error:
             raise EvaError(f"{entry.filename}: {error}") from None
-        found[name] = jpeg
-    return _text(_read(archive, texts[0], LARGEST_TEXT), texts[0].filename), found
+        jpegs[name] = jpeg
+    return _text(_read(archive, texts[0], LARGEST_TEXT), texts[0].filename), jpegs
 
 
 def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> bytes:
@@ -178,16 +178,16 @@ def _text(content: bytes, name: str) -> str:
 
 def import_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
     """Store the pictures, and make each a reference unless this lab has one there; return a message per scene."""
-    told: dict[str, Counter[str]] = {}
+    by_scene: dict[str, Counter[str]] = {}
     for row in rows:
-        told.setdefault(row["scene"], Counter())[_taken(row, found, user)] += 1
+        by_scene.setdefault(row["scene"], Counter())[_taken(row, found, user)] += 1
     return [
-        f"reference pictures of scene {scene}: " + ", ".join(f"{n} {what}" for what, n in counts.items())
-        for scene, counts in told.items()
+        f"reference pictures of scene {scene}: " + ", ".join(f"{n} {change}" for change, n in counts.items())
+        for scene, counts in by_scene.items()
     ]
 
 
-def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> str:
+def _taken(row: Mapping[str, Any], pictures: Mapping[str, bytes], user: User) -> str:
     position = Position.objects.filter(scene__name=row["scene"], number=row["position"]).first()
     if position is None:
         raise EvaError(_REFERENCE_POSITION_SCENE_DOES_NOT(position=row["position"], scene=row["scene"]))
@@ -195,11 +195,11 @@ def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> st
     if station is None:
         return f"left out, because there is no station {row['station']}"
     key = {"station": station, "position": position, "camera": row["camera"]}
-    ours = Reference.objects.filter(**key).first()
-    if ours is not None and (ours.picture, ours.regions) != (row["picture"], row["regions"]):
+    existing = Reference.objects.filter(**key).first()
+    if existing is not None and (existing.picture, existing.regions) != (row["picture"], row["regions"]):
         return "left out, because this lab has its own"
-    jpeg = found.get(row["picture"])
-    if ours is not None:
+    jpeg = pictures.get(row["picture"])
+    if existing is not None:
         if jpeg is not None:
             image_store.store_image(jpeg)  # restores a lost file
         return "the same"

@@ -75,16 +75,16 @@ _REGIONS = TypeAdapter(Annotated[list[Region], Field(max_length=MOST)])
 def regions_of(given: Any) -> list[Region]:
     """Return the validated regions with distinct names. Raises: EvaError with the first problem."""
     try:
-        found = _REGIONS.validate_python(given)
+        regions = _REGIONS.validate_python(given)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "regions"
         raise EvaError(_REGIONS_GIVEN(where=where, msg=first["msg"], input=first["input"])) from None
-    names = [region.name for region in found]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise EvaError(_REGIONS_THERE_TWICE_ALLOWED_EACH(twice=twice))
-    return found
+    names = [region.name for region in regions]
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise EvaError(_REGIONS_THERE_TWICE_ALLOWED_EACH(twice=repeated))
+    return regions
 
 
 def check_sizes(found: list[Region], jpeg: bytes) -> None:
@@ -128,24 +128,24 @@ def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, 
         raise EvaError(
             _REGION_HAS_NO_PIXEL_PICTURE(name=region.name, shape=after.shape[1], shape_2=after.shape[0])
         )
-    wanted = _band_passed(before, box)
+    pattern = _band_passed(before, box)
     around = (top - REACH, left - REACH, bottom + REACH, right + REACH)
     first_row, first_column, last_row, last_column = _inside(around, after)
-    places = _correlations(wanted, _band_passed(after, (first_row, first_column, last_row, last_column)))
+    places = _correlations(pattern, _band_passed(after, (first_row, first_column, last_row, last_column)))
     down = np.arange(places.shape[0]) + first_row - top
     across = np.arange(places.shape[1]) + first_column - left
     near = places[np.ix_(np.abs(down) <= TOLERANCE, np.abs(across) <= TOLERANCE)]
     row, column = np.unravel_index(int(places.argmax()), places.shape)
     right, below = int(across[column]), int(down[row])
-    seen = (
+    recognised = (
         places[row, column] >= _SEEN and max(abs(right), abs(below)) < REACH
     )  # a maximum at the edge of the search area is not a peak
     dx, dy = round(right * scale[0]), round(below * scale[1])
     return {
         "match": round(float(np.clip(near.max(), 0, 1)), 4),
-        "dx": dx if seen else None,
-        "dy": dy if seen else None,
-        "words": _words(dx, dy) if seen else "not recognised here or nearby",
+        "dx": dx if recognised else None,
+        "dy": dy if recognised else None,
+        "words": _words(dx, dy) if recognised else "not recognised here or nearby",
     }
 
 
@@ -155,22 +155,22 @@ def _words(dx: int, dy: int) -> str:
     return ", ".join(moved) or "in its place"
 
 
-def _correlations(wanted: _Pixels, around: _Pixels) -> _Pixels:
-    """Return the match of `wanted` at each position of `around` where it fits entirely."""
-    height, width, _ = wanted.shape
+def _correlations(pattern: _Pixels, around: _Pixels) -> _Pixels:
+    """Return the match of `pattern` at each position of `around` where it fits entirely."""
+    height, width, _ = pattern.shape
     shape = around.shape[:2]
-    centred = wanted - wanted.mean(axis=(0, 1))
+    centred = pattern - pattern.mean(axis=(0, 1))
     mine = max(float((centred**2).sum()), 1e-9)
     spectrum = np.fft.rfft2(around, axes=(0, 1)) * np.conj(np.fft.rfft2(centred, s=shape, axes=(0, 1)))
     rows, columns = shape[0] - height + 1, shape[1] - width + 1
     both = np.fft.irfft2(spectrum.sum(axis=2), s=shape, axes=(0, 1))[:rows, :columns]
     pixels = height * width
     sums, squares = _sums(around, height, width), _sums(around**2, height, width)
-    theirs = np.maximum((squares - sums**2 / pixels).sum(axis=2), 1e-9)
-    contrast = np.sqrt(theirs / mine)
+    variance = np.maximum((squares - sums**2 / pixels).sum(axis=2), 1e-9)
+    contrast = np.sqrt(variance / mine)
     fade = np.minimum(1.0, 2 * np.minimum(contrast, 1 / contrast))
-    found: _Pixels = both / np.sqrt(mine * theirs) * fade
-    return found
+    correlations: _Pixels = both / np.sqrt(mine * variance) * fade
+    return correlations
 
 
 def _sums(values: _Pixels, height: int, width: int) -> _Pixels:
@@ -219,11 +219,11 @@ def _band_passed(picture: _Pixels, box: tuple[int, int, int, int]) -> _Pixels:
         (first_column - wide[1], wide[3] - last_column),
         (0, 0),
     )
-    seen = np.pad(
+    padded = np.pad(
         picture[first_row:last_row, first_column:last_column].astype(np.float64), missing, mode="edge"
     )
-    inner = seen[_COARSE - _FINE : _FINE - _COARSE, _COARSE - _FINE : _FINE - _COARSE]
-    return _means(inner, 2 * _FINE + 1) - _means(seen, 2 * _COARSE + 1)
+    inner = padded[_COARSE - _FINE : _FINE - _COARSE, _COARSE - _FINE : _FINE - _COARSE]
+    return _means(inner, 2 * _FINE + 1) - _means(padded, 2 * _COARSE + 1)
 
 
 def _means(values: _Pixels, side: int) -> _Pixels:

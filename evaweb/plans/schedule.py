@@ -96,8 +96,8 @@ def schedule(
     drawn = _Coins(list(checkpoints), SeededDraws(key, "allocation"))
     for repetition in range(1, repetitions + 1):
         for condition in SeededDraws(key, f"conditions/{repetition}").shuffled(list(conditions)):
-            there = next(orders) if allocation == PAIRED else [drawn.next(condition) for _ in range(2)]
-            for place, checkpoint in enumerate(there):
+            arms = next(orders) if allocation == PAIRED else [drawn.next(condition) for _ in range(2)]
+            for place, checkpoint in enumerate(arms):
                 # The number must not reveal that a block has one checkpoint twice.
                 number = repetition if allocation == PAIRED else 2 * repetition - 1 + place
                 units.append(Unit(len(units), block, place, checkpoint, condition, number))
@@ -122,13 +122,13 @@ class _Coins:
 
 def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, int]]:
     """Return the numbers of trials of two checkpoints after each block."""
-    found: list[tuple[int, int]] = []
+    counts: list[tuple[int, int]] = []
     for unit in units:
-        if unit.block == len(found):
-            found.append(found[-1] if found else (0, 0))
-        first, second = found[-1]
-        found[-1] = (first + (unit.checkpoint == names[0]), second + (unit.checkpoint == names[1]))
-    return found
+        if unit.block == len(counts):
+            counts.append(counts[-1] if counts else (0, 0))
+        first, second = counts[-1]
+        counts[-1] = (first + (unit.checkpoint == names[0]), second + (unit.checkpoint == names[1]))
+    return counts
 
 
 def _orders(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
@@ -163,12 +163,12 @@ def check_schedule(
     checkpoints: Sequence[str], conditions: Sequence[Condition], repetitions: int, allocation: str
 ) -> None:
     """Raise EvaError if there can be no schedule with these parameters."""
-    for what, items in (("checkpoint", checkpoints), ("condition", conditions)):
+    for kind, items in (("checkpoint", checkpoints), ("condition", conditions)):
         if not items:
-            raise EvaError(_NO_PLAN_NEEDS_AT_LEAST(what=what))
-        twice = next((item for item in items if list(items).count(item) > 1), None)
-        if twice is not None:
-            raise EvaError(_NAMED_TWICE(what=what, twice=twice))
+            raise EvaError(_NO_PLAN_NEEDS_AT_LEAST(what=kind))
+        repeated = next((item for item in items if list(items).count(item) > 1), None)
+        if repeated is not None:
+            raise EvaError(_NAMED_TWICE(what=kind, twice=repeated))
     if repetitions < 1:
         raise EvaError(_REPETITIONS_ALLOWED_1_MORE(repetitions=repetitions))
     if allocation == RANDOM and len(checkpoints) != 2:

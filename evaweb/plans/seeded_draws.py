@@ -41,8 +41,8 @@ class SeededDraws:
 
     def shuffled(self, items: Sequence[T]) -> list[T]:
         """Return `items` in a uniformly random order (Fisher-Yates, from the end)."""
-        found = list(items)
-        for i in range(len(found) - 1, 0, -1):
+        shuffled = list(items)
+        for i in range(len(shuffled) - 1, 0, -1):
             j = self.below(i + 1)
-            found[i], found[j] = found[j], found[i]
-        return found
+            shuffled[i], shuffled[j] = shuffled[j], shuffled[i]
+        return shuffled

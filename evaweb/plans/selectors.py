@@ -41,11 +41,11 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
     """
     rows = plan_list(user=user).filter(name=name).order_by("-version")
     frozen = rows.exclude(state=PlanState.DRAFT)
-    found = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()
-    if found is None:
-        known = ", ".join(sorted(set(plan_list(user=user).values_list("name", flat=True)))) or "none yet"
-        raise NotFound(_NO_SUCH_PLAN(name=name, value=f" v{version}" if version else "", known=known))
-    return found
+    plan = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()
+    if plan is None:
+        names = ", ".join(sorted(set(plan_list(user=user).values_list("name", flat=True)))) or "none yet"
+        raise NotFound(_NO_SUCH_PLAN(name=name, value=f" v{version}" if version else "", known=names))
+    return plan
 
 
 def overlapping_plans(plan: Plan) -> QuerySet[Plan]:
@@ -55,17 +55,17 @@ def overlapping_plans(plan: Plan) -> QuerySet[Plan]:
     strategy.
     """
     rows = Checkpoint.objects.values_list("pk", "digest", "policy", "strategy")
-    what = {
+    label_of = {
         pk: json.dumps([weights or policy, strategy], sort_keys=True)
         for pk, weights, policy, strategy in rows
     }
-    mine = Counter(what[pk] for pk in plan.checkpoints.values_list("pk", flat=True))
+    mine = Counter(label_of[pk] for pk in plan.checkpoints.values_list("pk", flat=True))
     frozen = Plan.objects.exclude(name=plan.name).exclude(state=PlanState.DRAFT)
-    theirs: dict[int, Counter[str]] = defaultdict(Counter)
-    for other, checkpoint in frozen.values_list("pk", "checkpoints"):
+    by_plan: dict[int, Counter[str]] = defaultdict(Counter)
+    for plan_key, checkpoint in frozen.values_list("pk", "checkpoints"):
         if checkpoint is not None:
-            theirs[other][what[checkpoint]] += 1
-    same = [other for other, arms in theirs.items() if (arms & mine).total() >= 2]
+            by_plan[plan_key][label_of[checkpoint]] += 1
+    same = [plan_key for plan_key, arms in by_plan.items() if (arms & mine).total() >= 2]
     return frozen.filter(pk__in=same).order_by("name", "version")
 
 
@@ -96,7 +96,7 @@ def handout_of(*, trial: Trial) -> Handout | None:
 def reference_get(*, id: int) -> Reference:
     """Return the reference picture with that id. Raises: NotFound."""
     rows = Reference.objects.select_related("station", "position__scene", "by")
-    found = rows.filter(pk=id).first() if 0 < id < 2**63 else None
-    if found is None:
+    reference = rows.filter(pk=id).first() if 0 < id < 2**63 else None
+    if reference is None:
         raise NotFound(_NO_SUCH_REFERENCE(identity=id))
-    return found
+    return reference

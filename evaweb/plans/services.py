@@ -172,18 +172,18 @@ def plan_change(
 
     Fields that another user changed meanwhile stay unchanged and are reported, unless they are in `keep`.
     """
-    held = _lock_plan(plan)
-    require_editor(held, user)
-    sight = visibility_for_user(user)
-    now = values_of(held, sight)
+    locked = _lock_plan(plan)
+    require_editor(locked, user)
+    visibility = visibility_for_user(user)
+    now = values_of(locked, visibility)
     written, conflicts = merged(now, was, wanted, keep)
     if "owner" in written:
         require_role(user, Role.ADMIN)
     if written:
-        apply(held, {**now, **written}, sight.checkpoints)
-        _keep(held)
-        _log(held, user, CHANGE, f"changed {', '.join(sorted(written))}")
-        now = values_of(held, sight)
+        apply(locked, {**now, **written}, visibility.checkpoints)
+        _keep(locked)
+        _log(locked, user, CHANGE, f"changed {', '.join(sorted(written))}")
+        now = values_of(locked, visibility)
     return Changed(now, tuple(conflicts))
 
 
@@ -191,27 +191,27 @@ def _keep(plan: Plan) -> None:
     try:
         plan.full_clean()
     except ValidationError as invalid:
-        field, said = next(iter(invalid.message_dict.items()))
-        raise EvaError(f"{field}: {'; '.join(said)}") from None
+        field, messages = next(iter(invalid.message_dict.items()))
+        raise EvaError(f"{field}: {'; '.join(messages)}") from None
     plan.save()
 
 
 def _free_name(title: str) -> str:
     """Return an unused name for URLs; "new" is reserved for the page that creates plans."""
     stem = slugify(title)[:50].strip("-") or "plan"
-    taken = {*Plan.objects.filter(name__startswith=stem).values_list("name", flat=True), "new"}
-    names = (stem, *(f"{stem}-{number}" for number in range(2, len(taken) + 3)))
-    return next(name for name in names if name not in taken)
+    used = {*Plan.objects.filter(name__startswith=stem).values_list("name", flat=True), "new"}
+    names = (stem, *(f"{stem}-{number}" for number in range(2, len(used) + 3)))
+    return next(name for name in names if name not in used)
 
 
-def _log(plan: Plan, user: User, what: int, text: str) -> None:
+def _log(plan: Plan, user: User, flag: int, text: str) -> None:
     """Add a line to the plan's history in the admin pages; consecutive identical lines are written once."""
     rows = LogEntry.objects.filter(
         content_type=ContentType.objects.get_for_model(Plan), object_id=str(plan.pk)
     )
     last = rows.order_by("-pk").first()
     if last is None or (last.user_id, last.change_message) != (user.pk, text):
-        LogEntry.objects.log_actions(user.pk, [plan], what, text, single_object=True)
+        LogEntry.objects.log_actions(user.pk, [plan], flag, text, single_object=True)
 
 
 def freeze_plan(*, user: User, plan: Plan, seen: str = "") -> Plan:
@@ -247,37 +247,37 @@ def _drawn(plan: Plan) -> bytes:
 
 @transaction.atomic
 def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
-    held = _lock_plan(plan)
-    _require_owner(held, user)
-    if held.state != PlanState.DRAFT:
-        raise _no_draft(held)
-    if seen and seen != digest_of(values_of(held, visibility_for_user(user))):
-        raise Conflict(_CHANGED_SINCE_LOADED(held=held))
-    _check(held, user)
-    document = document_of(held, key)
-    held.document, held.digest, held.key = document, digest(document), key
-    units = units_of(held)
-    held.commitment = blinding.make_commitment(held.digest, units, bytes(held.key))
-    held.evaluation, new = Evaluation.objects.get_or_create(
-        name=held.name,
-        version=held.version,
-        defaults={"kind": Evaluation.Kind.PLAN, "description": held.title},
+    locked = _lock_plan(plan)
+    _require_owner(locked, user)
+    if locked.state != PlanState.DRAFT:
+        raise _no_draft(locked)
+    if seen and seen != digest_of(values_of(locked, visibility_for_user(user))):
+        raise Conflict(_CHANGED_SINCE_LOADED(held=locked))
+    _check(locked, user)
+    document = document_of(locked, key)
+    locked.document, locked.digest, locked.key = document, digest(document), key
+    units = units_of(locked)
+    locked.commitment = blinding.make_commitment(locked.digest, units, bytes(locked.key))
+    locked.evaluation, new = Evaluation.objects.get_or_create(
+        name=locked.name,
+        version=locked.version,
+        defaults={"kind": Evaluation.Kind.PLAN, "description": locked.title},
     )
     if not new:
         require_role(user, Role.ADMIN)  # it can reveal trials of a plan that another user may have owned
-    held.state, held.frozen_at = PlanState.FROZEN, timezone.now()
-    held.save()
-    _create_slots(held, units)
-    changes = difference(held.amends.document or {}, document) if held.amends else []
+    locked.state, locked.frozen_at = PlanState.FROZEN, timezone.now()
+    locked.save()
+    _create_slots(locked, units)
+    changes = difference(locked.amends.document or {}, document) if locked.amends else []
     changes = [line for line in changes if not line.startswith(_DRAWN)]
-    told = f"digest {held.digest}, {len(units)} trials, commitment {held.commitment}"
-    _note(held, user, "frozen", "\n".join([told, *changes]))
-    if held.amends and held.amends.state == PlanState.FROZEN:
-        _close(held.amends, user, f"amended by version {held.version}: {held.amended_because}")
-    if held.amends and held.amends.state == PlanState.CLOSED:
-        lapse_void_requests(_trials(held.amends), user=user, now=True)
+    summary = f"digest {locked.digest}, {len(units)} trials, commitment {locked.commitment}"
+    _note(locked, user, "frozen", "\n".join([summary, *changes]))
+    if locked.amends and locked.amends.state == PlanState.FROZEN:
+        _close(locked.amends, user, f"amended by version {locked.version}: {locked.amended_because}")
+    if locked.amends and locked.amends.state == PlanState.CLOSED:
+        lapse_void_requests(_trials(locked.amends), user=user, now=True)
     if not new:
-        _close(held, user, "its trials were made before the database was lost: amend it to make more")
+        _close(locked, user, "its trials were made before the database was lost: amend it to make more")
     plan.refresh_from_db()
     return plan
 
@@ -286,39 +286,39 @@ def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
 @transaction.atomic
 def amend_plan(*, user: User, plan: Plan, reason: str) -> Plan:
     """Create a draft of the next version from the frozen one, which continues until the new one is frozen."""
-    held = _lock_plan(plan)
-    _require_owner(held, user)
-    why = _reason(reason, "a plan is amended")
-    if held.state == PlanState.DRAFT:
-        raise Conflict(_STILL_A_DRAFT(held=held))
-    if held.state == PlanState.REVEALED:
-        raise Conflict(_REVEALED(held=held))
-    if hasattr(held, "amendment"):
-        raise Conflict(_AMENDED_ALREADY(held=held, version=held.amendment.version))
-    made = Plan.objects.create(
-        **{name: getattr(held, name) for name in _COPIED},
-        version=held.version + 1,
-        owner=held.owner,
-        first=held.first,
-        second=held.second,
-        amends=held,
-        amended_because=why,
+    locked = _lock_plan(plan)
+    _require_owner(locked, user)
+    text = _reason(reason, "a plan is amended")
+    if locked.state == PlanState.DRAFT:
+        raise Conflict(_STILL_A_DRAFT(held=locked))
+    if locked.state == PlanState.REVEALED:
+        raise Conflict(_REVEALED(held=locked))
+    if hasattr(locked, "amendment"):
+        raise Conflict(_AMENDED_ALREADY(held=locked, version=locked.amendment.version))
+    amendment = Plan.objects.create(
+        **{name: getattr(locked, name) for name in _COPIED},
+        version=locked.version + 1,
+        owner=locked.owner,
+        first=locked.first,
+        second=locked.second,
+        amends=locked,
+        amended_because=text,
     )
     for name in ("positions", "checkpoints", "stations"):
-        getattr(made, name).set(getattr(held, name).all())
-    _note(held, user, "amended", f"version {made.version} is being drafted: {why}")
-    return made
+        getattr(amendment, name).set(getattr(locked, name).all())
+    _note(locked, user, "amended", f"version {amendment.version} is being drafted: {text}")
+    return amendment
 
 
 @transaction.atomic
 def close_plan(*, user: User, plan: Plan, reason: str) -> Plan:
     """Close a plan: no more trials are handed out. Raises: Conflict while trials are unfinished."""
-    held = _lock_plan(plan)
-    _require_owner(held, user)
-    why = _reason(reason, "a plan is closed")
-    if held.state != PlanState.FROZEN:
-        raise Conflict(_NOT_RUNNING(held=held, state=held.get_state_display()))
-    _close(held, user, why)
+    locked = _lock_plan(plan)
+    _require_owner(locked, user)
+    text = _reason(reason, "a plan is closed")
+    if locked.state != PlanState.FROZEN:
+        raise Conflict(_NOT_RUNNING(held=locked, state=locked.get_state_display()))
+    _close(locked, user, text)
     plan.refresh_from_db()
     return plan
 
@@ -338,35 +338,35 @@ def reveal_plan(*, user: User, plan: Plan) -> Plan:
 
 @transaction.atomic
 def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | None] | None) -> Plan:
-    held = _lock_plan(plan)
-    _require_owner(held, user)
-    if held.state != PlanState.CLOSED:
-        raise Conflict(_NOT_CLOSED(held=held, state=held.get_state_display()))
-    units = units_of(held)
+    locked = _lock_plan(plan)
+    _require_owner(locked, user)
+    if locked.state != PlanState.CLOSED:
+        raise Conflict(_NOT_CLOSED(held=locked, state=locked.get_state_display()))
+    units = units_of(locked)
     if not blinding.verify_commitment(
-        digest(held.document or {}), units, bytes(held.key or b""), held.commitment
+        digest(locked.document or {}), units, bytes(locked.key or b""), locked.commitment
     ):
-        raise EvaError(_COMMITMENT_BROKEN(held=held, commitment=held.commitment))
-    if slots_of(held) != [unit.row for unit in units]:
-        raise EvaError(_RENAMED_SINCE_FROZEN(held=held))
-    lapse_void_requests(_trials(held), user=user, now=True)
-    held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
-    before = reveals.first_reveal(held)
-    if held.at_reveal is None:
-        as_ready = ready is not None and ready[0] == recorded_so_far(held)
-        held.at_reveal = (
-            before.at_reveal if before else ready[1] if ready and as_ready else reveal_record(held)
+        raise EvaError(_COMMITMENT_BROKEN(held=locked, commitment=locked.commitment))
+    if slots_of(locked) != [unit.row for unit in units]:
+        raise EvaError(_RENAMED_SINCE_FROZEN(held=locked))
+    lapse_void_requests(_trials(locked), user=user, now=True)
+    locked.state, locked.revealed_at, locked.revealed_by = PlanState.REVEALED, timezone.now(), user
+    before = reveals.first_reveal(locked)
+    if locked.at_reveal is None:
+        as_ready = ready is not None and ready[0] == recorded_so_far(locked)
+        locked.at_reveal = (
+            before.at_reveal if before else ready[1] if ready and as_ready else reveal_record(locked)
         )
     if before is None:
-        reveals.write_reveal(held, user, held.revealed_at)
-    what = "reveal" if held.blind else "close"
-    again = (
-        f"; what counts is that of the {what} of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
+        reveals.write_reveal(locked, user, locked.revealed_at)
+    act = "reveal" if locked.blind else "close"
+    addition = (
+        f"; what counts is that of the {act} of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
         if before
         else ""
     )
-    held.save()
-    _note(held, user, "revealed", f"key {bytes(held.key or b'').hex()}; commitment verified{again}")
+    locked.save()
+    _note(locked, user, "revealed", f"key {bytes(locked.key or b'').hex()}; commitment verified{addition}")
     plan.refresh_from_db()
     return plan
 
@@ -380,23 +380,23 @@ def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
     boundary found at a request is recorded whatever is corrected later; otherwise each request would reveal the effect
     of a correction. The reason states that a boundary was crossed or all pairs are made, never for which checkpoint.
     """
-    held = _lock_plan(plan)
-    found = findings_of(held) if held.state == PlanState.FROZEN else None
-    if found is None:
+    locked = _lock_plan(plan)
+    result = findings_of(locked) if locked.state == PlanState.FROZEN else None
+    if result is None:
         return
-    ended, waits = end_at_request(held), open_void_requests(_trials(held)).exists()
-    if asked and not ended and found.ended == "boundary":
+    ended, waits = end_at_request(locked), open_void_requests(_trials(locked)).exists()
+    if asked and not ended and result.ended == "boundary":
         # A refused void restores its trial; until it is answered, the result must not change.
-        ended = "" if waits else end_reason(held, found)
-        _note(held, user, CROSSED_EVENT if waits else ENDED_EVENT, end_reason(held, found))
-    if not (ended or found.ended) or waits or _unfinished(held):
+        ended = "" if waits else end_reason(locked, result)
+        _note(locked, user, CROSSED_EVENT if waits else ENDED_EVENT, end_reason(locked, result))
+    if not (ended or result.ended) or waits or _unfinished(locked):
         return
-    over = bool(ended) or not remaining(held, dropped_of(held))
-    if not remaining(held) or (asked and over) or ended:
-        why = ended or end_reason(held, found)
+    over = bool(ended) or not remaining(locked, dropped_of(locked))
+    if not remaining(locked) or (asked and over) or ended:
+        reason = ended or end_reason(locked, result)
         if not ended:
-            _note(held, user, ENDED_EVENT, why)
-        _close(held, user, why)
+            _note(locked, user, ENDED_EVENT, reason)
+        _close(locked, user, reason)
 
 
 def _on_trial_settled(trial: Trial, user: User) -> None:
@@ -423,7 +423,7 @@ def _unfinished(plan: Plan) -> list[Trial]:
     ]
 
 
-def _close(plan: Plan, user: User, why: str) -> None:
+def _close(plan: Plan, user: User, reason: str) -> None:
     unfinished = _unfinished(plan)
     if unfinished:
         trial = unfinished[0]
@@ -436,9 +436,9 @@ def _close(plan: Plan, user: User, why: str) -> None:
                 status=trial.get_status_display(),
             )
         )
-    plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), why
+    plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), reason
     plan.save()
-    _note(plan, user, "closed", why)
+    _note(plan, user, "closed", reason)
     if not plan.blind:  # an open plan may never be revealed, so its result is stored now
         transaction.on_commit(partial(_store_at_close, plan, user), robust=True)
 
@@ -447,28 +447,28 @@ def _store_at_close(plan: Plan, user: User) -> None:
     """Store the result of an open plan at its close; computed before locking, as that may take seconds."""
     while True:
         fresh = Plan.objects.get(pk=plan.pk)
-        at, found = recorded_so_far(fresh), reveal_record(fresh)
-        if found is None:
+        at, record = recorded_so_far(fresh), reveal_record(fresh)
+        if record is None:
             return
         with transaction.atomic():
-            held = _lock_plan(plan)
-            if held.at_reveal is not None or held.state != PlanState.CLOSED or held.closed_at is None:
+            locked = _lock_plan(plan)
+            if locked.at_reveal is not None or locked.state != PlanState.CLOSED or locked.closed_at is None:
                 return
-            if recorded_so_far(held) != at:
+            if recorded_so_far(locked) != at:
                 continue  # a score was corrected meanwhile
-            before = reveals.first_reveal(held)
-            held.at_reveal = before.at_reveal if before else found
+            before = reveals.first_reveal(locked)
+            locked.at_reveal = before.at_reveal if before else record
             if before is None:
-                reveals.write_reveal(held, user, held.closed_at)
-            held.save()
+                reveals.write_reveal(locked, user, locked.closed_at)
+            locked.save()
             return
 
 
 def _check(plan: Plan, user: User) -> None:
     """Raise EvaError with the first problem that prevents freezing, without names hidden from this user."""
-    found = next(problems(plan), None)
-    if found is not None:
-        raise EvaError(covered(plan, visibility_for_user(user))(found.text))
+    problem = next(problems(plan), None)
+    if problem is not None:
+        raise EvaError(covered(plan, visibility_for_user(user))(problem.text))
 
 
 def slots_of(plan: Plan) -> list[list[Any]]:
@@ -507,12 +507,12 @@ def _require_owner(plan: Plan, user: User) -> None:
         raise NotAllowed(_NOT_THE_OWNER(plan=plan, user=plan.owner.get_username()))
 
 
-def _note(plan: Plan, user: User, what: str, text: str) -> None:
-    PlanEvent.objects.create(plan=plan, by=user, what=what, text=text)
+def _note(plan: Plan, user: User, kind: str, text: str) -> None:
+    PlanEvent.objects.create(plan=plan, by=user, what=kind, text=text)
 
 
-def _reason(given: str, when: str) -> str:
-    why = given.strip()
-    if not why:
+def _reason(text: str, when: str) -> str:
+    reason = text.strip()
+    if not reason:
         raise EvaError(_NO_REASON(when=when))
-    return why
+    return reason

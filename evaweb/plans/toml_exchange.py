@@ -188,13 +188,13 @@ def import_file(*, user: User, text: str, pictures: Mapping[str, bytes] | None =
     `pictures`: content of an archive, by the names that references use.
     """
     require_role(user, Role.ADMIN)
-    given = _read(text)
+    tables = _read(text)
     with transaction.atomic():
         return [
-            *(_take_scene(table) for table in given.scene),
-            *(_take_checkpoint(table) for table in given.checkpoint),
-            *(_take_plan(table, user) for table in given.plan),
-            *import_references([row.model_dump() for row in given.reference], pictures or {}, user),
+            *(_take_scene(table) for table in tables.scene),
+            *(_take_checkpoint(table) for table in tables.checkpoint),
+            *(_take_plan(table, user) for table in tables.plan),
+            *import_references([row.model_dump() for row in tables.reference], pictures or {}, user),
         ]
 
 
@@ -210,51 +210,51 @@ def _read(text: str) -> File:
 
 
 def _take_scene(table: SceneTable) -> str:
-    made = Scene.objects.select_for_update().filter(name=table.name).first()
-    wanted = table.model_dump()
-    positions, milestones = wanted.pop("position"), wanted.pop("milestone")
-    if made is not None:
-        now = _scene_table(made)
-        changes = difference(now, {**wanted, "position": positions, "milestone": milestones})
+    existing = Scene.objects.select_for_update().filter(name=table.name).first()
+    values = table.model_dump()
+    positions, milestones = values.pop("position"), values.pop("milestone")
+    if existing is not None:
+        now = _scene_table(existing)
+        changes = difference(now, {**values, "position": positions, "milestone": milestones})
         if not changes:
-            return f"scene {made.name}: the same"
-        if protected_positions(made) or Reference.objects.filter(position__scene=made).exists():
-            raise _refused(f"scene {made.name}", changes)
-        made.positions.all().delete()
-        made.milestones.all().delete()
+            return f"scene {existing.name}: the same"
+        if protected_positions(existing) or Reference.objects.filter(position__scene=existing).exists():
+            raise _refused(f"scene {existing.name}", changes)
+        existing.positions.all().delete()
+        existing.milestones.all().delete()
     try:
         check_milestones([row["text"] for row in milestones])
     except Invalid as invalid:
         raise EvaError(f"scene {table.name}: {'; '.join(invalid.messages)}") from None
-    scene = made or Scene(name=table.name)
-    for name, value in wanted.items():
+    scene = existing or Scene(name=table.name)
+    for name, value in values.items():
         setattr(scene, name, value)
     _unchanged_note(scene, f"scene {table.name}")
     for row in positions:
         _unchanged_note(Position(scene=scene, **row), f"position {row['number']} of scene {table.name}")
     for row in milestones:
         _unchanged_note(Milestone(scene=scene, **row), f"milestone {row['order']} of scene {table.name}")
-    return f"scene {scene.name}: {'changed' if made else 'new'}"
+    return f"scene {scene.name}: {'changed' if existing else 'new'}"
 
 
 def _take_checkpoint(table: CheckpointTable) -> str:
-    made = Checkpoint.objects.select_for_update().filter(name=table.name).first()
-    wanted = table.model_dump()
-    if made is not None:
-        changes = difference(_checkpoint_table(made), wanted)
+    existing = Checkpoint.objects.select_for_update().filter(name=table.name).first()
+    values = table.model_dump()
+    if existing is not None:
+        changes = difference(_checkpoint_table(existing), values)
         if not changes:
-            return f"checkpoint {made.name}: the same"
-        if checkpoint_used(made):
-            raise _refused(f"checkpoint {made.name}", changes)
-    checkpoint = made or Checkpoint()
-    parent = wanted.pop("parent")
+            return f"checkpoint {existing.name}: the same"
+        if checkpoint_used(existing):
+            raise _refused(f"checkpoint {existing.name}", changes)
+    checkpoint = existing or Checkpoint()
+    parent = values.pop("parent")
     checkpoint.parent = Checkpoint.objects.filter(name=parent).first() if parent else None
     if parent and checkpoint.parent is None:
         raise EvaError(_CHECKPOINT_PARENT_DOES_NOT_EXIST(name=table.name, parent=parent))
-    for name, value in wanted.items():
+    for name, value in values.items():
         setattr(checkpoint, name, value)
     _unchanged_note(checkpoint, f"checkpoint {table.name}")
-    return f"checkpoint {checkpoint.name}: {'changed' if made else 'new'}"
+    return f"checkpoint {checkpoint.name}: {'changed' if existing else 'new'}"
 
 
 def _take_plan(table: PlanTable, user: User) -> str:
@@ -262,18 +262,18 @@ def _take_plan(table: PlanTable, user: User) -> str:
     if newest is not None and newest.state != PlanState.DRAFT:
         raise Conflict(_PLAN_AMEND_THEN_CHANGE_DRAFT(name=table.name, state=newest.get_state_display()))
     plan = newest or Plan(name=table.name, owner=user)
-    wanted = table.model_dump(exclude={"positions", "checkpoints", "stations", "comparison"})
-    for name, value in wanted.items():
+    values = table.model_dump(exclude={"positions", "checkpoints", "stations", "comparison"})
+    for name, value in values.items():
         setattr(plan, name, value)
     checkpoints = [_named(Checkpoint, "checkpoint", name, table) for name in table.checkpoints]
     stations = [_named(Station, "station", name, table) for name in table.stations]
     compared = [_named(Checkpoint, "checkpoint", name, table) for name in table.comparison]
     allowed = {Comparing.CONTROL: (1,), Comparing.ALL: (0,)}.get(Comparing(table.comparing), (0, 2))
     if len(compared) not in allowed:
-        words = " or ".join(map(str, allowed))
+        numbers = " or ".join(map(str, allowed))
         raise EvaError(
             _PLAN_COMPARISON_WITH_COMPARING_ALLOWED(
-                name=table.name, comparison=table.comparison, comparing=table.comparing, words=words
+                name=table.name, comparison=table.comparison, comparing=table.comparing, words=numbers
             )
         )
     plan.first, plan.second = (*compared, None, None)[:2]
@@ -285,28 +285,28 @@ def _take_plan(table: PlanTable, user: User) -> str:
 
 
 def _position(place: PlaceTable, table: PlanTable) -> Position:
-    found = Position.objects.filter(scene__name=place.scene, number=place.number).first()
-    if found is None:
+    position = Position.objects.filter(scene__name=place.scene, number=place.number).first()
+    if position is None:
         raise EvaError(_PLAN_POSITION_SCENE_DOES_NOT(name=table.name, number=place.number, scene=place.scene))
-    return found
+    return position
 
 
 def _named(model: type[_Row], kind: str, name: str, table: PlanTable) -> _Row:
-    found = model._default_manager.filter(name=name).first()
-    if found is None:
+    row = model._default_manager.filter(name=name).first()
+    if row is None:
         raise EvaError(_PLAN_DOES_NOT_EXIST(name=table.name, kind=kind, name_2=name))
-    return found
+    return row
 
 
-def _unchanged_note(row: models.Model, what: str) -> None:
+def _unchanged_note(row: models.Model, label: str) -> None:
     try:
         row.full_clean()
     except Invalid as invalid:
         problem = next(iter(invalid.message_dict.items()))
-        raise EvaError(f"{what}: {problem[0]}: {'; '.join(problem[1])}") from None
+        raise EvaError(f"{label}: {problem[0]}: {'; '.join(problem[1])}") from None
     row.save()
 
 
-def _refused(what: str, changes: list[str]) -> Conflict:
-    shown = "; ".join(changes[:5]) + (f"; and {len(changes) - 5} more" if len(changes) > 5 else "")
-    return Conflict(_HAS_TRIALS_ANOTHER_ONE_FILE(what=what, shown=shown))
+def _refused(label: str, changes: list[str]) -> Conflict:
+    listed = "; ".join(changes[:5]) + (f"; and {len(changes) - 5} more" if len(changes) > 5 else "")
+    return Conflict(_HAS_TRIALS_ANOTHER_ONE_FILE(what=label, shown=listed))

@@ -23,20 +23,20 @@ def picture(request: HttpRequest, name: str) -> HttpResponse:
 @require_safe
 def reference(request: HttpRequest, id: int) -> HttpResponse:
     """Show a reference picture with its regions, which operators can draw, and links to the other cameras."""
-    found = reference_get(id=id)
-    newest = references(station=found.station, position=found.position)
+    row = reference_get(id=id)
+    newest = references(station=row.station, position=row.position)
     context = {
-        "reference": found,
-        "newest": newest[found.camera],
+        "reference": row,
+        "newest": newest[row.camera],
         "cameras": sorted(newest.items()),
         "editing": {
-            "regions": found.regions,
+            "regions": row.regions,
             "most": region_matching.MOST,
-            "save": reverse("api:reference-regions", args=[found.pk]),
+            "save": reverse("api:reference-regions", args=[row.pk]),
             "next": reverse("reference", args=[0]),
         },
-        "may_draw": found.position is not None
-        and newest[found.camera].pk == found.pk
+        "may_draw": row.position is not None
+        and newest[row.camera].pk == row.pk
         and role_of(request.user) is not Role.VIEWER,
     }
     return render(request, "plans/reference.html", context)

@@ -29,16 +29,20 @@ class VisiblePreflight:
 
 def visible_preflight(row: Preflight, user: Any) -> VisiblePreflight:
     """Return the preflight as this user may see it."""
-    why = hidden_reason(row.checkpoint, user)
-    if not why:
+    reason = hidden_reason(row.checkpoint, user)
+    if not reason:
         return VisiblePreflight(row, row.report, row.reason, "")
     report = None if row.report is None else {key: row.report[key] for key in _TOLD if key in row.report}
-    return VisiblePreflight(row, report, "it ended without a report" if row.reason else "", why)
+    return VisiblePreflight(row, report, "it ended without a report" if row.reason else "", reason)
 
 
 def hidden_reason(checkpoint: Checkpoint, user: Any) -> str:
     """Return the reason why this user sees only the outcome of a preflight; "" if they see everything."""
     if role_of(user) is Role.VIEWER:
         return "addresses and times are shown to operators"
-    seen = visibility_for_user(user)
-    return f"addresses and times are hidden: {seen.plans}" if checkpoint.pk in seen.checkpoints else ""
+    visibility = visibility_for_user(user)
+    return (
+        f"addresses and times are hidden: {visibility.plans}"
+        if checkpoint.pk in visibility.checkpoints
+        else ""
+    )

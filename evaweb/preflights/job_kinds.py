@@ -24,5 +24,5 @@ def preflight(work: JobContext) -> Mapping[str, Any]:
     if row.status != PreflightStatus.RUNNING:
         return {"verdict": row.verdict}
     work.report_progress(f"asking the server of {row.checkpoint}")
-    asked = {"deployment": row.station.deployment, "changes": row.changes}
-    return {"verdict": finish_preflight(row=row, report=run_preflight(asked, LONGEST_S)).verdict}
+    request = {"deployment": row.station.deployment, "changes": row.changes}
+    return {"verdict": finish_preflight(row=row, report=run_preflight(request, LONGEST_S)).verdict}

@@ -33,10 +33,10 @@ def preflight_list(
 
 def preflight_get(*, id: UUID | str, sight: Visibility = FULL_VISIBILITY) -> Preflight:
     """Return the preflight with that id. Raises: NotFound."""
-    found = preflight_list(sight=sight).filter(pk=id).first()
-    if found is None:
+    row = preflight_list(sight=sight).filter(pk=id).first()
+    if row is None:
         raise NotFound(_PREFLIGHT_DOES_NOT_EXIST(identity=id))
-    return found
+    return row
 
 
 def preflight_newest(*, checkpoint: Checkpoint) -> Preflight | None:

@@ -100,10 +100,10 @@ def refresh_preflight(*, row: Preflight) -> Preflight:
         return finish_preflight(row=row, reason=str(gone))
     if ack.status != "done":
         return finish_preflight(row=row, reason=f"{row.station.name} was restarted meanwhile: ask again")
-    told = to_json_value(ack.data)
-    if told["running"]:
+    status = to_json_value(ack.data)
+    if status["running"]:
         return _overdue(row, "it did not end in time")
-    return finish_preflight(row=row, report=told["report"], reason=told["failure"])
+    return finish_preflight(row=row, report=status["report"], reason=status["failure"])
 
 
 def refresh_preflights(*, station: Station) -> int:
@@ -136,17 +136,17 @@ def _first_station() -> Station:
                 return station
         except StationGone:
             continue
-    known = next((station for station in stations if station.deployment), None)
-    if known is None:
+    first = next((station for station in stations if station.deployment), None)
+    if first is None:
         raise Conflict(_NO_STATION_FREE_NONE_HAS)
-    return known
+    return first
 
 
 def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
     """Return the server that a preflight would query; "" if the table is invalid, which the report explains."""
     args = {"policy": checkpoint.policy}
-    asked = Command(str(uuid4()), "policy_server", args, role=Role.OPERATOR, vouched=list(TABLES))
-    ack = connection_to(station.name).request(asked)
+    command = Command(str(uuid4()), "policy_server", args, role=Role.OPERATOR, vouched=list(TABLES))
+    ack = connection_to(station.name).request(command)
     return str(ack.data["server"]) if ack.status == "done" else ""
 
 
@@ -154,16 +154,16 @@ def _require_free(server: str, besides: Station) -> None:
     """Raise Conflict if another station is using the server, because answers could be late or mixed up."""
     if not server:
         return
-    for other in station_list(all_of_them=True).exclude(pk=besides.pk):
+    for station in station_list(all_of_them=True).exclude(pk=besides.pk):
         try:
-            ack = connection_to(other.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
+            ack = connection_to(station.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
         except StationGone:
             continue
         if ack.data.get("server") != server:
             continue
         state_is = complete_state_meaning(ack.data)["state_is"]
         if state_is["at_work"]:
-            raise Conflict(_WITH_SAME_POLICY_SERVER_PREFLIGHT(other=other, label=state_is["label"]))
+            raise Conflict(_WITH_SAME_POLICY_SERVER_PREFLIGHT(other=station, label=state_is["label"]))
 
 
 def _start_at_station(row: Preflight) -> Preflight:
@@ -173,8 +173,8 @@ def _start_at_station(row: Preflight) -> Preflight:
     checkpoint = {"id": row.checkpoint_id, "name": row.checkpoint.name}
     args = {"id": str(row.pk), **row.changes, "checkpoint": checkpoint}
     username = row.user.get_username() if row.user else ""
-    said = {"user": username, "holder": username, "role": role_of(row.user) if row.user else ""}
-    command = Command(str(uuid4()), "preflight", args, vouched=list(TABLES), **said)
+    person = {"user": username, "holder": username, "role": role_of(row.user) if row.user else ""}
+    command = Command(str(uuid4()), "preflight", args, vouched=list(TABLES), **person)
     try:
         ack = connection_to(row.station.name).request(command)
     except NoAnswer:

@@ -40,11 +40,11 @@ def newest(request: HttpRequest) -> HttpResponse:
 
 def context(row: Preflight, user: Any) -> dict[str, Any]:
     """Return the template context of a result."""
-    seen = visible_preflight(row, user)
+    visible = visible_preflight(row, user)
     return {
         "preflight": row,
-        "seen": seen,
-        "read": view_report(seen.report),
+        "seen": visible,
+        "read": view_report(visible.report),
         "running": row.status == PreflightStatus.RUNNING,
         "lacks": services.lacks(row=row),
         "age": time_since(row.asked_at, timezone.now()),

@@ -84,8 +84,8 @@ class TriggerSpec:
             different: The NULL-safe inequality operator of the database.
         """
         changed = " OR ".join(f'OLD."{column}" {different} NEW."{column}"' for column in self.columns)
-        kept = f"({self.only or 'TRUE'}) AND ({changed})"
-        update = " OR ".join(f"({each})" for each in (kept, *self.never))
+        protected = f"({self.only or 'TRUE'}) AND ({changed})"
+        update = " OR ".join(f"({condition})" for condition in (protected, *self.never))
         return {"UPDATE": update, "DELETE": self.only or "TRUE"} | (
             {"INSERT": self.late} if self.late else {}
         )

@@ -76,12 +76,12 @@ class RowPath:
     path: str
 
 
-def _moment(given: Any) -> datetime:
+def _moment(value: Any) -> datetime:
     """Parse a time in ISO 8601 with a zone, in years that every time zone can represent."""
-    found = datetime.fromisoformat(given) if isinstance(given, str) else None
-    if found is None or found.tzinfo is None or not 1900 <= found.year <= 9998:
+    moment = datetime.fromisoformat(value) if isinstance(value, str) else None
+    if moment is None or moment.tzinfo is None or not 1900 <= moment.year <= 9998:
         raise ValueError("allowed: date and time of ISO 8601 with a time zone, in the years 1900 to 9998")
-    return found
+    return moment
 
 
 def _storable(value: Any) -> Any:
@@ -91,8 +91,8 @@ def _storable(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError("it contains a number that is not finite")
     inner = (*value, *value.values()) if isinstance(value, dict) else value
-    for each in inner if isinstance(inner, list | tuple) else ():
-        _storable(each)
+    for item in inner if isinstance(inner, list | tuple) else ():
+        _storable(item)
     return value
 
 
@@ -114,8 +114,8 @@ class Line(BaseModel):
     @classmethod
     def path_of(cls, name: str) -> str:
         """Return the query path of field `name` from the row."""
-        found = (each.path for each in cls.model_fields[name].metadata if isinstance(each, RowPath))
-        return next(found, "") or name
+        paths = (mark.path for mark in cls.model_fields[name].metadata if isinstance(mark, RowPath))
+        return next(paths, "") or name
 
     @classmethod
     def names(cls) -> Iterable[str]:
@@ -145,15 +145,15 @@ class Line(BaseModel):
 
     def to_row_values(self) -> dict[str, Any]:
         """Return the values of the row, with people as accounts; values stored in other rows are omitted."""
-        found = {}
+        values = {}
         for name in type(self).names():
             field, _, further = type(self).path_of(name).partition("__")
             value = getattr(self, name)
             if further == "username":
-                found[field] = get_or_create_person(value)
+                values[field] = get_or_create_person(value)
             elif not further and name not in self.ELSEWHERE and not isinstance(value, Line):
-                found[field] = value
-        return found
+                values[field] = value
+        return values
 
 
 def resolve_path(row: Any, path: str) -> Any:
@@ -183,10 +183,10 @@ def missing_rows(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -
     ((belongs, whose),) = owner.items()
     last = {line.uuid: line for line in lines}  # type: ignore[attr-defined]
     rows = dict(model._default_manager.filter(uuid__in=last).values_list("uuid", belongs))
-    for uuid, other in rows.items():
-        if other != whose.pk:
+    for uuid, owner_key in rows.items():
+        if owner_key != whose.pk:
             raise EvaError(
-                _ITS_IS_OF(verbose_name=model._meta.verbose_name, uuid=uuid, belongs=belongs, other=other)
+                _ITS_IS_OF(verbose_name=model._meta.verbose_name, uuid=uuid, belongs=belongs, other=owner_key)
             )
     return [line for uuid, line in last.items() if uuid not in rows]
 
@@ -216,13 +216,13 @@ class Journal(Generic[AnyLine]):
 
         A truncated or invalid line is skipped: `say` is called with file, line number and field.
         """
-        path, found, lines = self.path(uuid), [], _reader(_kinds[self.folder])
+        path, records, lines = self.path(uuid), [], _reader(_kinds[self.folder])
         for number, line in read_numbered_lines(path):
             try:
-                found.append(lines.validate_json(line))
+                records.append(lines.validate_json(line))
             except ValidationError as error:
                 say(f"{path}: line {number} {_wrong(error)}")
-        return found
+        return records
 
 
 @cache
@@ -248,8 +248,8 @@ def _wrong(error: ValidationError) -> str:
     """Return the first problem of a line, to be appended to its name."""
     first = error.errors()[0]
     if first["type"] == "json_invalid":
-        why, _, _ = first["ctx"]["error"].partition(" at line ")
-        return f"is not whole and was left out: {why}"
+        reason, _, _ = first["ctx"]["error"].partition(" at line ")
+        return f"is not whole and was left out: {reason}"
     place = ".".join(map(str, first["loc"]))
     return f"was left out: {place}{' is ' if place else ''}{first['input']!r:.80}: {first['msg']}"
 
@@ -263,15 +263,15 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
     text = json.dumps(
         line, allow_nan=False, separators=(",", ":")
     )  # ASCII output: line separators are escaped
-    done = "nothing was changed"
+    effect = "nothing was changed"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab+", buffering=0) as file:
             append_durably(file, text.encode() + b"\n")
     except OSError as error:
         if isinstance(error, AppendError) and not error.is_restored:
-            done = "what was written could not be removed: the next reconcile may read it as valid"
-        raise NotWritten(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
+            effect = "what was written could not be removed: the next reconcile may read it as valid"
+        raise NotWritten(_NOT_KEPT(strerror=error.strerror, path=path, done=effect)) from error
 
 
 def read_numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:

@@ -45,7 +45,7 @@ class AutomaticJudgeAdmin(admin.ModelAdmin):
         self._each(request, rows, judge_forbid, "allowed its address no longer")
 
     def _each(
-        self, request: HttpRequest, rows: QuerySet[AutomaticJudge], act: Callable[..., None], said: str
+        self, request: HttpRequest, rows: QuerySet[AutomaticJudge], act: Callable[..., None], label: str
     ) -> None:
         user: Any = request.user
         for judge in rows:
@@ -54,5 +54,5 @@ class AutomaticJudgeAdmin(admin.ModelAdmin):
             except EvaError as fault:
                 messages.error(request, str(fault))
                 continue
-            self.log_change(request, judge, f"{said}: {judge.address}")
-            messages.success(request, f"{judge}: {said}")
+            self.log_change(request, judge, f"{label}: {judge.address}")
+            messages.success(request, f"{judge}: {label}")

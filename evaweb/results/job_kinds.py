@@ -20,12 +20,12 @@ _NAMED = 50  # codes of trials without images in the result
 def judge(work: JobContext) -> Mapping[str, Any]:
     """Show a plan's trials to a judge, and enqueue a job for the remaining ones; args: plan, judge."""
     plan, name = Plan.objects.get(pk=work.args["plan"]), work.args["judge"]
-    until, shown = time.monotonic() + _TURN_S, 0
+    until, count = time.monotonic() + _TURN_S, 0
     while automatic.judge_next_trial(plan=plan, name=name):
-        shown += 1
-        work.report_progress(f"{shown} trials were shown to {name}")
+        count += 1
+        work.report_progress(f"{count} trials were shown to {name}")
         if time.monotonic() >= until:
             automatic.enqueue_judging(plan=plan, judge=name)
             break
     waiting, unseen = automatic.unjudged_trials(plan=plan, name=name)
-    return {"shown": shown, "left": waiting, "without_pictures": unseen[:_NAMED]}
+    return {"shown": count, "left": waiting, "without_pictures": unseen[:_NAMED]}

@@ -120,10 +120,10 @@ def plan_at_reveal(digest: str) -> Plan:
     Raises:
         NotFound: If there is none.
     """
-    found = Plan.objects.filter(at_reveal__digest=digest).first()
-    if found is None:
+    plan = Plan.objects.filter(at_reveal__digest=digest).first()
+    if plan is None:
         raise NotFound(_NO_REVEAL_HAS_DIGEST_STANDS(digest=digest))
-    return found
+    return plan
 
 
 def plan_get(*, name: str, version: int | None = None) -> Plan:
@@ -134,15 +134,15 @@ def plan_get(*, name: str, version: int | None = None) -> Plan:
     """
     rows = Plan.objects.select_related("owner", "first", "second", "evaluation", "revealed_by", "amends")
     versions = list(rows.filter(name=name).order_by("-version"))
-    found = [row for row in versions if version in (None, row.version)]
-    if not found:
-        there = ", ".join(str(row.version) for row in versions)
+    matches = [row for row in versions if version in (None, row.version)]
+    if not matches:
+        numbers = ", ".join(str(row.version) for row in versions)
         raise NotFound(
-            _PLAN_HAS_NO_VERSION_THERE(name=name, version=version, there=there)
-            if there
+            _PLAN_HAS_NO_VERSION_THERE(name=name, version=version, there=numbers)
+            if numbers
             else _PLAN_DOES_NOT_EXIST(name=name)
         )
-    return found[0]
+    return matches[0]
 
 
 def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
@@ -165,11 +165,13 @@ def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
 
     The progress does not depend on checkpoints, so that it reveals nothing.
     """
-    given = list(plans)
-    slots = Slot.objects.filter(plan__in=given).order_by().values_list("plan").annotate(n=Count("pk"))
+    listed = list(plans)
+    slots = Slot.objects.filter(plan__in=listed).order_by().values_list("plan").annotate(n=Count("pk"))
     foreseen: dict[int, int] = dict(slots)
-    trials = Trial.objects.filter(evaluation__in=[plan.evaluation_id for plan in given if plan.evaluation_id])
-    made = (
+    trials = Trial.objects.filter(
+        evaluation__in=[plan.evaluation_id for plan in listed if plan.evaluation_id]
+    )
+    counts = (
         trials.order_by()
         .values("evaluation")
         .annotate(
@@ -179,10 +181,11 @@ def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
             until=Max("ended_at"),
         )
     )
-    found = {row.pop("evaluation"): row for row in made}
+    by_evaluation = {row.pop("evaluation"): row for row in counts}
     nothing: dict[str, Any] = {"attempts": 0, "counted": 0, "since": None, "until": None}
     return [
-        PlanRow(plan, foreseen.get(plan.pk, 0), **found.get(plan.evaluation_id, nothing)) for plan in given
+        PlanRow(plan, foreseen.get(plan.pk, 0), **by_evaluation.get(plan.evaluation_id, nothing))
+        for plan in listed
     ]
 
 
@@ -240,8 +243,8 @@ def station_activity() -> list[StationActivity]:
     open_ones = Trial.objects.filter(station__in=stations, status__in=UNFINISHED).select_related(
         "scene", "position", "checkpoint", "evaluation", "operator", "handout__plan"
     )
-    found = {trial.station_id: trial for trial in open_ones.order_by("pk")}
-    return [StationActivity(station, found.get(station.pk)) for station in stations]
+    by_station = {trial.station_id: trial for trial in open_ones.order_by("pk")}
+    return [StationActivity(station, by_station.get(station.pk)) for station in stations]
 
 
 def recent_trials(limit: int = 12) -> QuerySet[Trial]:

@@ -26,10 +26,10 @@ def review_lines(uuid: UUID) -> dict[str, Sequence[AnyReview]]:
 @register_sidecar_writer
 def write_review_sidecars(uuid: UUID, folder: Path) -> Mapping[str, Path]:
     """Write the sidecar files to `folder` and return them by kind; empty kinds have no file."""
-    made = {}
-    for kind, said in review_lines(uuid).items():
-        if said:
-            made[kind] = folder / f"{kind}.jsonl"
-            lines = (json.dumps(line.model_dump(mode="json", exclude={"kind"})) + "\n" for line in said)
-            made[kind].write_text("".join(lines), "utf-8")
-    return made
+    paths = {}
+    for kind, reviews in review_lines(uuid).items():
+        if reviews:
+            paths[kind] = folder / f"{kind}.jsonl"
+            lines = (json.dumps(line.model_dump(mode="json", exclude={"kind"})) + "\n" for line in reviews)
+            paths[kind].write_text("".join(lines), "utf-8")
+    return paths

@@ -39,14 +39,14 @@ def quality(work: JobContext) -> Mapping[str, Any]:
     bounds = bounds_file()
     settings = read_settings(bounds) if bounds.exists() else QualitySettings()
     work.report_progress("every frame and picture is looked at")
-    found = _inspected(episode, settings).to_dict()
+    report = _inspected(episode, settings).to_dict()
     path = report_file(episode.uuid)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, to_json(found, "the report"))
+    write_atomic(path, to_json(report, "the report"))
     services.record_quality(
-        episode=episode, document=found, at=datetime.fromtimestamp(path.stat().st_mtime, UTC)
+        episode=episode, document=report, at=datetime.fromtimestamp(path.stat().st_mtime, UTC)
     )
-    return {"clean": found["clean"], "worst": found["worst"], "counts": found["counts"]}
+    return {"clean": report["clean"], "worst": report["worst"], "counts": report["counts"]}
 
 
 def _inspected(episode: Episode, settings: QualitySettings) -> Report:
@@ -58,13 +58,13 @@ def _inspected(episode: Episode, settings: QualitySettings) -> Report:
     from runtime.quality.inspection import check_dataset_episode, check_episode
 
     folder = journal_folder(episode.uuid)
-    told = read_json(folder / "manifest.json").get("imported")
-    if isinstance(told, Mapping):
-        dataset = data_dir() / (episode.dataset or str(told["dataset"]))
+    imported = read_json(folder / "manifest.json").get("imported")
+    if isinstance(imported, Mapping):
+        dataset = data_dir() / (episode.dataset or str(imported["dataset"]))
         index = next((index for index, uuid in uuids_of(dataset).items() if uuid == str(episode.uuid)), None)
         if index is not None:
             return check_dataset_episode(
-                dataset, index, settings, state=str(told["state"]), robot=str(told["robot"])
+                dataset, index, settings, state=str(imported["state"]), robot=str(imported["robot"])
             )
     return check_episode(folder, settings)
 
@@ -78,31 +78,31 @@ def write_sidecars_job(work: JobContext) -> Mapping[str, Any]:
     dataset = data_dir() / episode.dataset
     work.hold([episode.dataset])
     with TemporaryDirectory() as folder:
-        said = write_review_sidecars(episode.uuid, Path(folder))
+        paths = write_review_sidecars(episode.uuid, Path(folder))
         for kind in ("reviews", "annotations"):
-            attach_sidecar(dataset, str(episode.uuid), kind, said.get(kind))
-    counts = {kind: len(kept) for kind, kept in review_lines(episode.uuid).items()}
+            attach_sidecar(dataset, str(episode.uuid), kind, paths.get(kind))
+    counts = {kind: len(lines) for kind, lines in review_lines(episode.uuid).items()}
     return {"attached": True, **counts}
 
 
 @periodic_task("episodes to be checked")
 def find_unchecked_episodes() -> int:
     """Queue checks of newly closed episodes."""
-    found = list(selectors.unchecked_episodes()[:AT_ONCE])
-    for episode in found:
+    episodes = list(selectors.unchecked_episodes()[:AT_ONCE])
+    for episode in episodes:
         services.request_quality_check(episode=episode)
-    return len(found)
+    return len(episodes)
 
 
 @periodic_task("reviews to be published")
 def find_outdated_sidecars() -> int:
     """Queue updates of published episodes with newer reviews, or reviews older than the publication."""
-    found = list(selectors.outdated_episodes()[:AT_ONCE])
-    for standing in found:
+    rows = list(selectors.outdated_episodes()[:AT_ONCE])
+    for standing in rows:
         with transaction.atomic():
             # Requested once, whatever its outcome: a failed job remains visible and can be retried.
             upto = max(standing.changed_at, standing.episode.published_at)
             Standing.objects.filter(pk=standing.pk).update(attached_at=upto)
             uuid = str(standing.episode_id)
             enqueue(kind="sides", key=f"sides:{uuid}", args={"uuid": uuid})
-    return len(found)
+    return len(rows)

@@ -98,21 +98,21 @@ REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, Remova
 
 def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
     """Return the tags that are left after all lines; of two tags with the same words the first."""
-    found: dict[UUID, TagLine] = {}
+    by_uuid: dict[UUID, TagLine] = {}
     for line in lines:
         if isinstance(line, TagLine):
-            found[line.uuid] = line
+            by_uuid[line.uuid] = line
         elif isinstance(line, UntagLine):
-            found.pop(line.uuid, None)
-    return list({line.words: line for line in reversed(found.values())}.values())
+            by_uuid.pop(line.uuid, None)
+    return list({line.words: line for line in reversed(by_uuid.values())}.values())
 
 
 def segments_of(lines: Sequence[AnyReview]) -> list[SegmentLine]:
     """Return the segments that are left after all lines, sorted by frames."""
-    found: dict[UUID, SegmentLine] = {}
+    by_uuid: dict[UUID, SegmentLine] = {}
     for line in lines:
         if isinstance(line, SegmentLine):
-            found[line.uuid] = line
+            by_uuid[line.uuid] = line
         elif isinstance(line, RemovalLine):
-            found.pop(line.uuid, None)
-    return sorted(found.values(), key=lambda segment: (segment.first, segment.last, segment.at))
+            by_uuid.pop(line.uuid, None)
+    return sorted(by_uuid.values(), key=lambda segment: (segment.first, segment.last, segment.at))

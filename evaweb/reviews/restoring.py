@@ -31,9 +31,9 @@ def restore(kept: RestorableRun) -> int:
     if not lines:
         return 0
     with transaction.atomic():
-        made = _reviews(episode, [line for line in lines if isinstance(line, ReviewLine)])
-        made += _segments(episode, lines, whole=not left_out)
-        return made + _tags(episode, lines, whole=not left_out)
+        created = _reviews(episode, [line for line in lines if isinstance(line, ReviewLine)])
+        created += _segments(episode, lines, whole=not left_out)
+        return created + _tags(episode, lines, whole=not left_out)
 
 
 def _checked(episode: Episode) -> None:
@@ -65,20 +65,20 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
 
     If lines were skipped (not `whole`), rows are only added, because the missing lines may have changed other rows.
     """
-    wanted = {line.uuid: line for line in segments_of(lines)}
+    by_uuid = {line.uuid: line for line in segments_of(lines)}
     changed = 0
-    for line in missing_rows(Segment, list(wanted.values()), episode=episode):
+    for line in missing_rows(Segment, list(by_uuid.values()), episode=episode):
         Segment.objects.create(episode=episode, **line.to_row_values())
         changed += 1
     gone: list[UUID] = []
     if whole:
         rows = {row.uuid: row for row in Segment.objects.filter(episode=episode)}
-        for uuid, line in wanted.items():
+        for uuid, line in by_uuid.items():
             facts = line.model_dump(exclude={"kind", "uuid", "by"})
             if any(getattr(rows[uuid], name) != value for name, value in facts.items()):
                 Segment.objects.filter(pk=uuid).update(**facts)
                 changed += 1
-        gone = [uuid for uuid in rows if uuid not in wanted]
+        gone = [uuid for uuid in rows if uuid not in by_uuid]
         Segment.objects.filter(pk__in=gone).delete()
     if changed or gone:
         services.touch_standing(episode=episode)
@@ -87,11 +87,11 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
 
 def _tags(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
     """Update the rows from the lines; if lines were skipped, rows are only added."""
-    wanted = tags_of(lines)
-    gone = Tag.objects.filter(episode=episode).exclude(pk__in=[line.uuid for line in wanted])
+    tags = tags_of(lines)
+    gone = Tag.objects.filter(episode=episode).exclude(pk__in=[line.uuid for line in tags])
     changed = gone.delete()[0] if whole else 0
-    there = set(Tag.objects.filter(episode=episode).values_list("words", flat=True))
-    for line in missing_rows(Tag, [line for line in wanted if line.words not in there], episode=episode):
+    texts = set(Tag.objects.filter(episode=episode).values_list("words", flat=True))
+    for line in missing_rows(Tag, [line for line in tags if line.words not in texts], episode=episode):
         Tag.objects.create(episode=episode, **line.to_row_values())
         changed += 1
     return changed

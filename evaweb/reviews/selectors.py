@@ -48,10 +48,10 @@ def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
 
 def report_get(*, uuid: UUID) -> Mapping[str, Any]:
     """Return the stored quality report. Raises: NotFound before the checks; Conflict if it is damaged."""
-    found = report_of(uuid=uuid)
-    if found is None:
+    report = report_of(uuid=uuid)
+    if report is None:
         raise NotFound(_EPISODE_HAS_NOT_BEEN_CHECKED(uuid=uuid))
-    return found
+    return report
 
 
 def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list[Review], list[Segment], int]:
@@ -105,21 +105,21 @@ def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
     """
     waiting = unreviewed_episodes()
     count = waiting.count()
-    here = Episode.objects.filter(uuid=after).first() if after else None
-    if here is None:
+    current = Episode.objects.filter(uuid=after).first() if after else None
+    if current is None:
         return waiting.first(), count
-    others = waiting.exclude(uuid=here.uuid)
-    below = others
-    if here.started_at is not None:
-        same = Q(started_at=here.started_at, created_at__lt=here.created_at)
-        below = others.filter(Q(started_at__lt=here.started_at) | Q(started_at=None) | same)
-    return below.first() or others.first(), count
+    others_waiting = waiting.exclude(uuid=current.uuid)
+    below = others_waiting
+    if current.started_at is not None:
+        same = Q(started_at=current.started_at, created_at__lt=current.created_at)
+        below = others_waiting.filter(Q(started_at__lt=current.started_at) | Q(started_at=None) | same)
+    return below.first() or others_waiting.first(), count
 
 
 def unchecked_episodes() -> QuerySet[Episode]:
     """Return the closed local episodes whose checks were never requested, oldest first."""
-    here = Episode.objects.filter(status__in=CLOSED, away_since=None)
-    return here.filter(standing__asked_at=None).order_by("created_at")
+    present = Episode.objects.filter(status__in=CLOSED, away_since=None)
+    return present.filter(standing__asked_at=None).order_by("created_at")
 
 
 def outdated_episodes() -> QuerySet[Standing]:

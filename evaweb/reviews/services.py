@@ -86,11 +86,11 @@ def add_review(
     _locked_episode(episode)
     if frame is not None and not 0 <= frame < episode.frames:
         raise EvaError(_FRAME_ALLOWED(frame=frame, last=episode.frames - 1))
-    said = {"verdict": verdict, "note": note, "frame": frame, "reviewer": user}
+    values = {"verdict": verdict, "note": note, "frame": frame, "reviewer": user}
     newest = Review.objects.filter(episode=episode).order_by("-at", "-pk").first()
-    if newest is not None and all(getattr(newest, name) == value for name, value in said.items()):
+    if newest is not None and all(getattr(newest, name) == value for name, value in values.items()):
         return newest  # repeated request whose answer was lost
-    review = Review(episode=episode, at=timezone.now(), **said)
+    review = Review(episode=episode, at=timezone.now(), **values)
     REVIEWS.append(episode.uuid, ReviewLine.written(review))
     review.save(force_insert=True)
     touch_standing(episode=episode, review=review if verdict in DECIDES else None)
@@ -125,10 +125,10 @@ def save_segment(
     _locked_episode(episode)
     if not 0 <= first <= last < episode.frames:
         raise EvaError(_FIRST_LAST_ALLOWED_FRAMES_0(first=first, last=last, frames=episode.frames - 1))
-    said = {"first": first, "last": last, "label": label, "milestone": milestone}
-    there = Segment.objects.filter(episode=episode, annotator=user, **said).first()
-    if there is not None and segment in (None, there.pk):
-        return there  # repeated request whose answer was lost
+    values = {"first": first, "last": last, "label": label, "milestone": milestone}
+    existing = Segment.objects.filter(episode=episode, annotator=user, **values).first()
+    if existing is not None and segment in (None, existing.pk):
+        return existing  # repeated request whose answer was lost
     row = _own(user, episode, segment) if segment else Segment(episode=episode, annotator=user)
     row.first, row.last, row.label, row.milestone, row.at = first, last, label, milestone, timezone.now()
     REVIEWS.append(episode.uuid, SegmentLine.written(row))
@@ -143,8 +143,8 @@ def remove_segment(*, user: Any, episode: Episode, segment: UUID) -> None:
     require_role(user, Role.OPERATOR)
     _locked_episode(episode)
     row = _own(user, episode, segment)
-    said = {"by": user.get_username(), "at": timezone.now().isoformat()}
-    REVIEWS.append(episode.uuid, RemovalLine.written(row, **said))
+    author = {"by": user.get_username(), "at": timezone.now().isoformat()}
+    REVIEWS.append(episode.uuid, RemovalLine.written(row, **author))
     row.delete()
     touch_standing(episode=episode)
 
@@ -175,23 +175,23 @@ def tags_change(
 ) -> Tagged:
     """Add and remove tags of a closed episode, whoever added them; operators only."""
     require_role(user, Role.OPERATOR)
-    wanted, unwanted = [tag_of(words) for words in add], {tag_of(words) for words in remove}
-    if both := unwanted & set(wanted):
+    added, unwanted = [tag_of(text) for text in add], {tag_of(text) for text in remove}
+    if both := unwanted & set(added):
         raise EvaError(f"add and remove both say {', '.join(sorted(both))}: say it in one of them")
     _locked_episode(episode)
-    there = {row.words: row for row in Tag.objects.filter(episode=episode)}
-    gone = [there.pop(words) for words in sorted(unwanted) if words in there]
-    new = [words for words in dict.fromkeys(wanted) if words not in there]
-    if len(there) + len(new) > MOST_TAGS:
+    by_text = {row.words: row for row in Tag.objects.filter(episode=episode)}
+    gone = [by_text.pop(text) for text in sorted(unwanted) if text in by_text]
+    new = [text for text in dict.fromkeys(added) if text not in by_text]
+    if len(by_text) + len(new) > MOST_TAGS:
         raise Conflict(
-            f"episode {episode.uuid} would have {len(there) + len(new)} tags; allowed: at most {MOST_TAGS}"
+            f"episode {episode.uuid} would have {len(by_text) + len(new)} tags; allowed: at most {MOST_TAGS}"
         )
     for row in gone:
-        said = {"by": user.get_username(), "at": timezone.now().isoformat()}
-        REVIEWS.append(episode.uuid, UntagLine.written(row, **said))
+        author = {"by": user.get_username(), "at": timezone.now().isoformat()}
+        REVIEWS.append(episode.uuid, UntagLine.written(row, **author))
         row.delete()
-    for words in new:
-        row = Tag(episode=episode, words=words, by=user, at=timezone.now())
+    for text in new:
+        row = Tag(episode=episode, words=text, by=user, at=timezone.now())
         REVIEWS.append(episode.uuid, TagLine.written(row))
         row.save(force_insert=True)
     return Tagged(tuple(new), tuple(row.words for row in gone))
@@ -199,14 +199,14 @@ def tags_change(
 
 def tag_of(given: str) -> str:
     """Return the normalized tag. Raises: EvaError if it is invalid."""
-    words = " ".join(clean_text("tag", given, LONGEST_TAG).casefold().split())
+    text = " ".join(clean_text("tag", given, LONGEST_TAG).casefold().split())
     try:
-        check_name(words)
+        check_name(text)
     except ValidationError as fault:
         raise EvaError(f"tag: {fault.messages[0]}") from None
-    if not words or "," in words or len(words) > LONGEST_TAG:  # casefold can lengthen a text
+    if not text or "," in text or len(text) > LONGEST_TAG:  # casefold can lengthen a text
         raise EvaError(f"tag = {given!r:.80}; allowed: 1 to {LONGEST_TAG} characters without a comma")
-    return words
+    return text
 
 
 # --- checks --------------------------------------------------------------------------------------------------

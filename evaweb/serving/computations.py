@@ -87,23 +87,23 @@ class ComputeProcess:
             if self._wire is None:
                 self._wire = self._start()
             self._wire.send((work, given))
-            done, found, seconds = self._wire.recv()
+            succeeded, result, seconds = self._wire.recv()
         except (EOFError, OSError) as error:
             log.error("the process that computes has ended: %r", error)
             self.end()
             raise Busy(_LOST) from error
-        if not done:
-            raise found
-        return found, seconds
+        if not succeeded:
+            raise result
+        return result, seconds
 
     def _start(self) -> Connection[Any, Any]:
-        here, there = socket.socketpair()
-        with there:
-            command = [sys.executable, "-m", "evaweb.serving.computations", str(there.fileno())]
+        own_end, child_end = socket.socketpair()
+        with child_end:
+            command = [sys.executable, "-m", "evaweb.serving.computations", str(child_end.fileno())]
             self._process = subprocess.Popen(
-                command, pass_fds=[there.fileno()], stdin=subprocess.DEVNULL, cwd=_ROOT
+                command, pass_fds=[child_end.fileno()], stdin=subprocess.DEVNULL, cwd=_ROOT
             )
-        return Connection(here.detach())
+        return Connection(own_end.detach())
 
     def end(self) -> None:
         """Kill the process; the next call starts a new one."""
@@ -172,11 +172,11 @@ class Questions:
 
         Not for request threads.
         """
-        found, _ = self._turns.submit(share, partial(self._run, work, *given)).result()
-        return found
+        result, _ = self._turns.submit(share, partial(self._run, work, *given)).result()
+        return result
 
     def _begun(self, person: Hashable, question: tuple[Callable[..., Any], tuple[Any, ...]]) -> Future[Any]:
-        if any(who == person for who, _ in list(self._asked.values())):
+        if any(asker == person for asker, _ in list(self._asked.values())):
             raise Busy(_ONE_AT_A_TIME)
         spent = self._spent_by(person)
         if spent >= AT_ONCE_S:
@@ -189,14 +189,14 @@ class Questions:
         return coming
 
     def _answered(self, person: Hashable, question: tuple[Callable[..., Any], tuple[Any, ...]]) -> Any:
-        work, given = question
-        found, seconds = self._run(work, *given)
+        work, arguments = question
+        result, seconds = self._run(work, *arguments)
         with self._lock:
             self._spent[person] = (self._spent_by(person) + seconds, self._clock())
-            self._kept[question] = found
+            self._kept[question] = result
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
-        return found
+        return result
 
     def _spent_by(self, person: Hashable) -> float:
         seconds, at = self._spent.get(person, (0.0, 0.0))
@@ -214,15 +214,15 @@ def _main() -> None:
     threading.Thread(target=_end_with, args=(wire.fileno(),), daemon=True).start()
     while True:
         try:
-            work, given = wire.recv()
+            work, arguments = wire.recv()
         except (EOFError, ConnectionError):
             return
         began = time.process_time()
         try:
-            done, found = True, work(*given)
+            succeeded, result = True, work(*arguments)
         except Exception as fault:  # raised again in the parent
-            done, found = False, fault
-        wire.send((done, found, time.process_time() - began))
+            succeeded, result = False, fault
+        wire.send((succeeded, result, time.process_time() - began))
 
 
 def _end_with(descriptor: int) -> None:

@@ -45,8 +45,8 @@ class LoginMiddleware(LoginRequiredMiddleware):
     def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
         if not getattr(view, "login_required", True):
             return None
-        found: HttpResponseBase | None = super().process_view(request, view, *given)
-        return found
+        response: HttpResponseBase | None = super().process_view(request, view, *given)
+        return response
 
 
 class RefusalMiddleware(MiddlewareMixin):
@@ -58,7 +58,7 @@ class RefusalMiddleware(MiddlewareMixin):
     def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
         # REST parses its body itself, checked by evaweb.api.request_validation.
         fields = [request.GET] if _of_programs(request) else [request.GET, request.POST]
-        texts = (text for one in fields for name, values in one.lists() for text in (name, *values))
+        texts = (text for query in fields for name, values in query.lists() for text in (name, *values))
         if not is_text(request.path):
             return error_response(request, _NUL_IN_ADDRESS, 404, "refused.html")
         if not all(map(is_text, texts)):
@@ -74,10 +74,10 @@ class RefusalMiddleware(MiddlewareMixin):
         spoken = response.headers.get("Content-Type", "").startswith("application/json")
         if status < 400 or spoken or not (_of_programs(request) or status == 405):
             return response
-        said = error_response(request, _sentence_of(request, response), status, "refused.html")
+        page = error_response(request, _sentence_of(request, response), status, "refused.html")
         if "Allow" in response.headers:
-            said["Allow"] = response["Allow"]
-        return said
+            page["Allow"] = response["Allow"]
+        return page
 
     def process_exception(self, request: HttpRequest, exception: Exception) -> HttpResponse | None:
         if _is_no_number(exception):
@@ -114,8 +114,8 @@ def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
 
 def _is_no_number(exception: Exception) -> bool:
     """Return True if forms have passed a number that the database or Python cannot represent."""
-    said = str(exception)
-    none = "expected a number but got" in said or said.startswith("Exceeds the limit")
+    text = str(exception)
+    none = "expected a number but got" in text or text.startswith("Exceeds the limit")
     return isinstance(exception, OverflowError) or none
 
 

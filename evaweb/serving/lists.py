@@ -95,10 +95,10 @@ def words_of(text: str, name: str = "words") -> list[str]:
     """Return the distinct search words of `text`. Raises: EvaError if the text is too long or has too many."""
     if len(text) > LONGEST:
         raise EvaError(_CHARACTERS_ALLOWED(name=name, count=len(text), most=LONGEST))
-    words = list(dict.fromkeys(text.split()))
-    if len(words) > _MOST_WORDS:
-        raise EvaError(_WORDS_ALLOWED(name=name, count=len(words), most=_MOST_WORDS))
-    return words
+    parts = list(dict.fromkeys(text.split()))
+    if len(parts) > _MOST_WORDS:
+        raise EvaError(_WORDS_ALLOWED(name=name, count=len(parts), most=_MOST_WORDS))
+    return parts
 
 
 class Listing:
@@ -109,7 +109,9 @@ class Listing:
         self.number = given.get("page")
         self.wants_file = given.get("format") == "csv"
         try:
-            self.chosen = {one.name: self._value(one, given.get(one.name, "").strip()) for one in filters}
+            self.chosen = {
+                entry.name: self._value(entry, given.get(entry.name, "").strip()) for entry in filters
+            }
             self.sort = self._sort(given.get("sort", ""))
         except EvaError as fault:
             self.refuse(fault)
@@ -117,20 +119,20 @@ class Listing:
     def refuse(self, fault: EvaError) -> None:
         """Reset filters and sort order, and record the reason."""
         self.fault, self.sort = str(fault), ""
-        self.chosen = {one.name: "" for one in self.filters}
+        self.chosen = {entry.name: "" for entry in self.filters}
 
-    def _value(self, one: Filter, value: str) -> str:
-        known = [key for key, _ in one.choices]
-        if value and one.kind == CHOICE and one.strict and value not in known:
-            raise EvaError(f"{one.name} = {value!r:.80}; allowed: {', '.join(known) or 'nothing yet'}")
-        if one.kind == SEARCH:
-            words_of(value, one.name)
+    def _value(self, entry: Filter, value: str) -> str:
+        keys = [key for key, _ in entry.choices]
+        if value and entry.kind == CHOICE and entry.strict and value not in keys:
+            raise EvaError(f"{entry.name} = {value!r:.80}; allowed: {', '.join(keys) or 'nothing yet'}")
+        if entry.kind == SEARCH:
+            words_of(value, entry.name)
         return value
 
     def _sort(self, value: str) -> str:
-        known = [column.name for column in self.columns if column.by]
-        if value and value.removeprefix("-") not in known:
-            raise EvaError(_SORT_ALLOWED_EACH_ALSO_WITH(value=value, known=", ".join(known)))
+        names = [column.name for column in self.columns if column.by]
+        if value and value.removeprefix("-") not in names:
+            raise EvaError(_SORT_ALLOWED_EACH_ALSO_WITH(value=value, known=", ".join(names)))
         return value
 
     # --- as it is shown ----------------------------------------------------------------------------------------
@@ -150,9 +152,9 @@ class Listing:
     def chips(self) -> list[Chip]:
         """Active filters."""
         return [
-            Chip(f"{one.label}: {dict(one.choices).get(value, value)}", self._without(one.name))
-            for one in self.filters
-            if (value := self.chosen[one.name])
+            Chip(f"{entry.label}: {dict(entry.choices).get(value, value)}", self._without(entry.name))
+            for entry in self.filters
+            if (value := self.chosen[entry.name])
         ]
 
     def _without(self, name: str) -> str:
@@ -164,7 +166,7 @@ class Listing:
     @property
     def fields(self) -> list[tuple[Filter, str]]:
         """Filters, each with its chosen value."""
-        return [(one, self.chosen[one.name]) for one in self.filters]
+        return [(entry, self.chosen[entry.name]) for entry in self.filters]
 
     # --- its rows ----------------------------------------------------------------------------------------------
 
@@ -175,7 +177,10 @@ class Listing:
         down = self.sort.startswith("-")
         fields = [F(field) for field in self._by]
         return rows.order_by(
-            *(one.desc(nulls_last=True) if down else one.asc(nulls_last=True) for one in fields),
+            *(
+                expression.desc(nulls_last=True) if down else expression.asc(nulls_last=True)
+                for expression in fields
+            ),
             "-pk" if down else "pk",
         )
 
@@ -191,9 +196,9 @@ class Listing:
         if not self.sort:
             return list(rows)
         value = attrgetter(*self._by)
-        known = [row for row in rows if value(row) is not None]
-        known.sort(key=value, reverse=self.sort.startswith("-"))
-        return known + [row for row in rows if value(row) is None]
+        valued = [row for row in rows if value(row) is not None]
+        valued.sort(key=value, reverse=self.sort.startswith("-"))
+        return valued + [row for row in rows if value(row) is None]
 
     @property
     def _by(self) -> tuple[str, ...]:
@@ -227,5 +232,5 @@ class Listing:
 
 
 def _in_order(rows: QuerySet[Any], keys: Sequence[Any]) -> list[Any]:
-    found: Mapping[Any, Any] = rows.order_by().in_bulk(keys)
-    return [found[key] for key in keys if key in found]  # rows may have been deleted meanwhile
+    by_key: Mapping[Any, Any] = rows.order_by().in_bulk(keys)
+    return [by_key[key] for key in keys if key in by_key]  # rows may have been deleted meanwhile

@@ -56,11 +56,11 @@ def lockout_response(request: HttpRequest, *given: Any) -> HttpResponse:
     seconds = _seconds_to(until or _name_until(request))
     minutes = ceil(seconds / 60)
     if until is not None:
-        said = _MANY_NAMES(names=MOST_NAMES, minutes=minutes)
+        text = _MANY_NAMES(names=MOST_NAMES, minutes=minutes)
     else:
         sentence = _LOCKED if minutes > 1 else _LOCKED_FOR_A_MINUTE
-        said = sentence(times=settings.AXES_FAILURE_LIMIT, minutes=minutes)
-    response = error_response(request, said, 429, "registration/locked.html")
+        text = sentence(times=settings.AXES_FAILURE_LIMIT, minutes=minutes)
+    response = error_response(request, text, 429, "registration/locked.html")
     response["Retry-After"] = str(seconds)
     return response
 

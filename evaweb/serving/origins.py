@@ -20,40 +20,40 @@ def is_own_origin(origin: str, host: str, scheme: str, web_port: int | None = No
     web, `web_port` on that host over plain HTTP counts too; behind a proxy all share one origin.
     """
     try:
-        asked = urlsplit(origin)
-        asked_of = asked.netloc
+        parsed = urlsplit(origin)
+        netloc = parsed.netloc
     except ValueError:
         return False
-    if not asked_of:
+    if not netloc:
         return False
-    beside = (
-        web_port is not None and asked.scheme == "http" and _parts(asked_of) == (_parts(host)[0], web_port)
+    at_web_port = (
+        web_port is not None and parsed.scheme == "http" and _parts(netloc) == (_parts(host)[0], web_port)
     )
-    same = (asked.scheme, asked_of) == (scheme, host)
-    return beside or same or origin in settings.CSRF_TRUSTED_ORIGINS
+    same = (parsed.scheme, netloc) == (scheme, host)
+    return at_web_port or same or origin in settings.CSRF_TRUSTED_ORIGINS
 
 
 def scheme_of(scope: Mapping[str, Any]) -> str:
     """Return "https" or "http" as the browser used it; a trusted proxy's header takes precedence."""
     if settings.SECURE_PROXY_SSL_HEADER is not None:
         meta, https = settings.SECURE_PROXY_SSL_HEADER
-        wanted = meta.removeprefix("HTTP_").replace("_", "-").lower().encode()
-        said = next((value for name, value in scope["headers"] if name.lower() == wanted), None)
-        if said is not None:
-            return "https" if said.decode("latin-1").split(",")[0].strip() == https else "http"
+        header = meta.removeprefix("HTTP_").replace("_", "-").lower().encode()
+        scheme = next((value for name, value in scope["headers"] if name.lower() == header), None)
+        if scheme is not None:
+            return "https" if scheme.decode("latin-1").split(",")[0].strip() == https else "http"
     return "https" if scope.get("scheme") in ("https", "wss") else "http"
 
 
 def origin_at_port(host: str, web_port: int, port: int) -> str:
     """Return the plain-HTTP origin at `port`; "" if `host` does not have the web's own port but a proxy's."""
-    name, asked = _parts(host)
-    return f"http://{name}:{port}" if asked == web_port else ""
+    name, host_port = _parts(host)
+    return f"http://{name}:{port}" if host_port == web_port else ""
 
 
 def _parts(host: str) -> tuple[str, int]:
     """Return name and port of a Host header over plain HTTP."""
-    found = _PORT.search(host)
-    return (host[: found.start()], int(found[1])) if found else (host, 80)
+    match = _PORT.search(host)
+    return (host[: match.start()], int(match[1])) if match else (host, 80)
 
 
 class SameOrigin:

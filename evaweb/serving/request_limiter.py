@@ -44,16 +44,18 @@ class RequestLimiter:
             await self._application(scope, receive, send)
             return
         address = client_key(scope)
-        who = address, _login_of(scope)
+        person = address, _login_of(scope)
         if (
             len(self._tasks) >= _AT_ONCE + _MOST_WAITING
-            or self._people.asking[who] >= _OF_ONE + _WAITING_OF_ONE
+            or self._people.asking[person] >= _OF_ONE + _WAITING_OF_ONE
         ):
             await _refuse(send)
         else:
-            shares = self._people.acquire_share(who), self._addresses.acquire_share(address)
+            shares = self._people.acquire_share(person), self._addresses.acquire_share(address)
             task = asyncio.create_task(self._in_turn(scope, _Client(receive, send), *shares))
-            task.add_done_callback(lambda _: (self._people.answered(who), self._addresses.answered(address)))
+            task.add_done_callback(
+                lambda _: (self._people.answered(person), self._addresses.answered(address))
+            )
             self._tasks.add(task)  # strong reference: the event loop has only weak ones
             task.add_done_callback(self._tasks.discard)
             await asyncio.shield(task)
@@ -100,8 +102,8 @@ class _Shares:
 
 
 def _is_export(scope: dict[str, Any]) -> bool:
-    asked = scope.get("query_string", b"").lower()
-    return scope["path"].endswith(".csv") or any(word in asked for word in _EXPORTED)
+    query = scope.get("query_string", b"").lower()
+    return scope["path"].endswith(".csv") or any(word in query for word in _EXPORTED)
 
 
 def _login_of(scope: dict[str, Any]) -> bytes:

@@ -31,12 +31,12 @@ _POLICY = b"default-src 'self'"  # for scripts that run as workers
 
 def digest_of(folders: Iterable[Path], *versions: str) -> str:
     """Return a digest [16 hex digits] of all files in `folders` and of the versions of packages with static files."""
-    found = hashlib.sha256("\n".join(versions).encode())
+    digest = hashlib.sha256("\n".join(versions).encode())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             content = hashlib.sha256(path.read_bytes()).hexdigest()
-            found.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
-    return found.hexdigest()[:16]
+            digest.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +67,19 @@ class StaticFiles:
     async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
         path: str = scope["path"]
         name = path.removeprefix(_PREFIX)
-        asked = _DIGEST.match(name)
+        match = _DIGEST.match(name)
         file = None
         if path.startswith(_PREFIX) and scope["method"] in ("GET", "HEAD"):
-            file = await self._file(name[asked.end() :] if asked else name)
+            file = await self._file(name[match.end() :] if match else name)
         if file is None:
             await self._application(scope, receive, send)
         else:
-            current = asked is not None and asked[1] == self._digest and file.changed < self._began
+            current = match is not None and match[1] == self._digest and file.changed < self._began
             await _answer(scope, send, file, _KEPT if current else _ASKED)
 
     async def _file(self, name: str) -> _File | None:
-        if (kept := self._files.get(name)) is not None:
-            return kept
+        if (cached := self._files.get(name)) is not None:
+            return cached
         if (path := _found(name)) is None:
             return None
         content = path.read_bytes()
@@ -96,10 +96,10 @@ def _found(name: str) -> Path | None:
     from django.contrib.staticfiles import finders
 
     try:
-        found = finders.find(name) if name else None
+        path = finders.find(name) if name else None
     except (SuspiciousFileOperation, ValueError):  # a path outside the folder, or with a NUL
         return None
-    return Path(found) if isinstance(found, str) and Path(found).is_file() else None
+    return Path(path) if isinstance(path, str) and Path(path).is_file() else None
 
 
 def _made(path: Path, content: bytes) -> _File:
@@ -115,11 +115,11 @@ def _made(path: Path, content: bytes) -> _File:
 
 
 async def _answer(scope: dict[str, Any], send: Any, file: _File, keeping: bytes) -> None:
-    given = dict(scope["headers"])
-    packs = bool(file.packed) and b"gzip" in given.get(b"accept-encoding", b"")
+    request_headers = dict(scope["headers"])
+    packs = bool(file.packed) and b"gzip" in request_headers.get(b"accept-encoding", b"")
     tag = file.tag[:-1] + b'-gzip"' if packs else file.tag
     headers = [*file.headers, (b"cache-control", keeping), (b"etag", tag)]
-    if tag in given.get(b"if-none-match", b""):
+    if tag in request_headers.get(b"if-none-match", b""):
         await _send(send, 304, headers)
         return
     content = file.packed if packs else file.content
@@ -130,6 +130,6 @@ async def _answer(scope: dict[str, Any], send: Any, file: _File, keeping: bytes)
 
 
 async def _send(send: Any, status: int, headers: list[tuple[bytes, bytes]], content: bytes = b"") -> None:
-    told = dict(DEFAULT_HEADERS) | {b"content-security-policy": _POLICY} | dict(headers)
-    await send({"type": "http.response.start", "status": status, "headers": list(told.items())})
+    all_headers = dict(DEFAULT_HEADERS) | {b"content-security-policy": _POLICY} | dict(headers)
+    await send({"type": "http.response.start", "status": status, "headers": list(all_headers.items())})
     await send({"type": "http.response.body", "body": content})

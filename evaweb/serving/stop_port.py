@@ -36,8 +36,8 @@ def remove_stop_port() -> None:
 def read_stop_port() -> StopPort | None:
     """Return the announced ports, None if there is no valid announcement."""
     try:
-        found = json.loads(_path().read_bytes())
-        return StopPort(int(found["port"]), int(found["web_port"]))
+        fields = json.loads(_path().read_bytes())
+        return StopPort(int(fields["port"]), int(fields["web_port"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -47,10 +47,14 @@ def origin_for(request: HttpRequest) -> str:
 
     There is none for a page that came through a proxy or with EVA_HTTPS: it must not call plain HTTP.
     """
-    found = read_stop_port()
-    if found is None or settings.SESSION_COOKIE_SECURE or request.META["SERVER_PORT"] != str(found.web_port):
+    stop_port = read_stop_port()
+    if (
+        stop_port is None
+        or settings.SESSION_COOKIE_SECURE
+        or request.META["SERVER_PORT"] != str(stop_port.web_port)
+    ):
         return ""
-    return origin_at_port(request.get_host(), found.web_port, found.port)
+    return origin_at_port(request.get_host(), stop_port.web_port, stop_port.port)
 
 
 def _path() -> Path:

@@ -51,7 +51,7 @@ def shown(scene: Scene) -> dict[str, Any]:
             "number": row.number,
             "label": row.label,
             "bench": row.bench,
-            "picture": next((one["picture"] for one in pictures.get(row.pk, ())), ""),
+            "picture": next((reference["picture"] for reference in pictures.get(row.pk, ())), ""),
         }
         for row in scene.positions.all()
     ]
@@ -112,11 +112,11 @@ def _references(scene: Scene) -> dict[int, list[dict[str, str]]]:
         (row.position_id, row.station.name, row.camera): row
         for row in Reference.objects.filter(position__scene=scene).select_related("station").order_by("pk")
     }
-    found: dict[int, list[dict[str, str]]] = defaultdict(list)
+    by_position: dict[int, list[dict[str, str]]] = defaultdict(list)
     for (position, station, camera), row in sorted(newest.items()):
         picture, page = reverse("picture", args=[row.picture]), reverse("reference", args=[row.pk])
-        found[position].append({"station": station, "camera": camera, "picture": picture, "page": page})
-    return dict(found)
+        by_position[position].append({"station": station, "camera": camera, "picture": picture, "page": page})
+    return dict(by_position)
 
 
 # --- the operator's view -------------------------------------------------------------------------------------
@@ -127,13 +127,13 @@ def operators_view(request: HttpRequest, given: Any, position: Any) -> str:
 
     `given` is the scene, `position` the index of the position in it.
     """
-    wanted = table_of(given)
-    scene = Scene(**wanted.model_dump(exclude={"positions", "milestones"}))
+    table = table_of(given)
+    scene = Scene(**table.model_dump(exclude={"positions", "milestones"}))
     milestones = [
         Milestone(pk=place, order=place, **_fields(row))
-        for place, row in enumerate(wanted.milestones, start=1)
+        for place, row in enumerate(table.milestones, start=1)
     ]
-    rows = [Position(scene=scene, **_fields(row)) for row in wanted.positions]
+    rows = [Position(scene=scene, **_fields(row)) for row in table.positions]
     chosen = rows[position] if isinstance(position, int) and 0 <= position < len(rows) else Position()
     trial = {"scene": scene, "position": chosen, "pk": 0}
     panel = {

@@ -55,11 +55,11 @@ def _scenes() -> Card:
     rows = scene_list(all_of_them=True).annotate(
         n_positions=Count("positions", distinct=True), n_milestones=Count("milestones", distinct=True)
     )
-    missing = [one for row in rows.filter(active=True) for one in _missing_of(row)]
+    missing = [problem for row in rows.filter(active=True) for problem in _missing_of(row)]
     if not rows.filter(active=True):
         missing.append(Missing("No scene is offered to operators.", reverse("setup-new-scene")))
-    what = "What the robot is to do, from which positions, and what counts as success."
-    return _card("Scenes", what, rows, reverse("setup-scenes"), reverse("setup-new-scene"), missing)
+    text = "What the robot is to do, from which positions, and what counts as success."
+    return _card("Scenes", text, rows, reverse("setup-scenes"), reverse("setup-new-scene"), missing)
 
 
 def _missing_of(scene: Any) -> Iterator[Missing]:
@@ -74,9 +74,9 @@ def _missing_of(scene: Any) -> Iterator[Missing]:
         yield Missing(f"{scene} does not say what counts as success.", f"{address}#words")
 
 
-def _checkpoints(sight: Visibility) -> Card:
-    rows = checkpoint_list(all_of_them=True, sight=sight)
-    usable = preflight_list(sight=sight).filter(status=PreflightStatus.DONE, report__verdict=Verdict.OK)
+def _checkpoints(visibility: Visibility) -> Card:
+    rows = checkpoint_list(all_of_them=True, sight=visibility)
+    usable = preflight_list(sight=visibility).filter(status=PreflightStatus.DONE, report__verdict=Verdict.OK)
     untried = rows.filter(active=True).exclude(pk__in=usable.values("checkpoint"))
     missing = [
         Missing(
@@ -88,8 +88,8 @@ def _checkpoints(sight: Visibility) -> Card:
     add = reverse("admin:trials_checkpoint_add")
     if not rows:
         missing.append(Missing("No checkpoint yet.", add))
-    what = "Trained policies, and the addresses of their servers."
-    return _card("Checkpoints", what, rows, reverse("admin:trials_checkpoint_changelist"), add, missing)
+    text = "Trained policies, and the addresses of their servers."
+    return _card("Checkpoints", text, rows, reverse("admin:trials_checkpoint_changelist"), add, missing)
 
 
 def _plans(user: Any) -> Card:
@@ -110,8 +110,8 @@ def _plans(user: Any) -> Card:
     add = reverse("result-plan-new")
     if not rows:
         missing.append(Missing("No plan yet: trials outside a plan answer no question.", add))
-    what = "Questions, and the trials that answer them."
-    return _card("Plans", what, rows, reverse("admin:plans_plan_changelist"), add, missing)
+    text = "Questions, and the trials that answer them."
+    return _card("Plans", text, rows, reverse("admin:plans_plan_changelist"), add, missing)
 
 
 def _people() -> Card:
@@ -126,8 +126,8 @@ def _people() -> Card:
             else "Nobody runs trials"
         )
         missing.append(Missing(f"{only}: there is no second rater.", add))
-    what = "Accounts, each with one role: viewer, operator or administrator."
-    return _card("People", what, rows, reverse("admin:auth_user_changelist"), add, missing)
+    text = "Accounts, each with one role: viewer, operator or administrator."
+    return _card("People", text, rows, reverse("admin:auth_user_changelist"), add, missing)
 
 
 def _stations() -> Card:
@@ -142,13 +142,13 @@ def _stations() -> Card:
     add = reverse("admin:stations_station_add")
     if not rows:
         missing.append(Missing("No station yet.", add))
-    what = "Robots on their benches, each with the runtime that moves it."
-    return _card("Stations", what, rows, reverse("admin:stations_station_changelist"), add, missing)
+    text = "Robots on their benches, each with the runtime that moves it."
+    return _card("Stations", text, rows, reverse("admin:stations_station_changelist"), add, missing)
 
 
-def _card(title: str, what: str, rows: QuerySet[Any], address: str, add: str, missing: list[Missing]) -> Card:
+def _card(title: str, text: str, rows: QuerySet[Any], address: str, add: str, missing: list[Missing]) -> Card:
     newest = max(rows, key=lambda row: row.pk, default=None)
-    return Card(title, what, len(rows), str(newest or ""), address, add, tuple(missing))
+    return Card(title, text, len(rows), str(newest or ""), address, add, tuple(missing))
 
 
 def scene_rows() -> QuerySet[Scene]:

@@ -63,31 +63,31 @@ def scene(request: HttpRequest, name: str) -> HttpResponse:
     """Render the editor of a scene, read-only for users who may not write; write a posted scene."""
     if request.method == "POST":
         return _written(request, name)
-    found = _scene(name)
-    if found.name != name:  # requested by id: the page saves under the name
-        return redirect("setup-scene", name=found.name)
-    return _editor(request, editing.existing(found))
+    row = _scene(name)
+    if row.name != name:  # requested by id: the page saves under the name
+        return redirect("setup-scene", name=row.name)
+    return _editor(request, editing.existing(row))
 
 
 @require_GET
 def sheet(request: HttpRequest, name: str) -> HttpResponse:
     """Render the positions for printing in true size."""
-    found = _scene(name)
-    return render(request, "setup/sheet.html", {"scene": found, "drawn": editing.shown(found)})
+    row = _scene(name)
+    return render(request, "setup/sheet.html", {"scene": row, "drawn": editing.shown(row)})
 
 
 @require_POST
 def preview(request: HttpRequest) -> JsonResponse:
     """Return the operator's set-up and score cards of a scene that need not be saved."""
-    given = _posted(request)
-    return JsonResponse({"html": editing.operators_view(request, given.get("scene"), given.get("position"))})
+    body = _posted(request)
+    return JsonResponse({"html": editing.operators_view(request, body.get("scene"), body.get("position"))})
 
 
 @require_GET
 def live(request: HttpRequest, name: str, camera: str) -> HttpResponse:
     """Return the current image of a station's camera."""
-    found = image_store.current_images(station_get(name=name), [camera], _PATIENCE_S)
-    return HttpResponse(found[camera], content_type="image/jpeg")
+    images = image_store.current_images(station_get(name=name), [camera], _PATIENCE_S)
+    return HttpResponse(images[camera], content_type="image/jpeg")
 
 
 def _scene(name: str) -> Any:
@@ -109,29 +109,29 @@ def _posted(request: HttpRequest) -> dict[str, Any]:
     if request.content_type != "application/json":
         raise EvaError(_SENT_ALLOWED_APPLICATION_JSON(content_type=request.content_type))
     try:
-        given = bounded.parse_json(request.body, "the scene", LONGEST_SCENE)
+        body = bounded.parse_json(request.body, "the scene", LONGEST_SCENE)
     except bounded.UnreadableDocument as error:
         raise EvaError(str(error)) from None
-    if not isinstance(given, dict):
-        raise EvaError(_SENT_ALLOWED_TABLE_WITH_SCENE(given=given))
-    return given
+    if not isinstance(body, dict):
+        raise EvaError(_SENT_ALLOWED_TABLE_WITH_SCENE(given=body))
+    return body
 
 
 def _written(request: HttpRequest, name: str | None) -> JsonResponse:
     """Write the scene; answer with its address, remarks and state, or with each faulty place."""
-    given = _posted(request)
-    wanted = given.get("scene")
+    body = _posted(request)
+    table = body.get("scene")
     try:
-        found, remarks = scene_write(
+        scene, remarks = scene_write(
             user=request.user,  # type: ignore[arg-type]
             name=name,
-            given=wanted if isinstance(wanted, dict) else {},
-            seen=str(given.get("seen", "")),
+            given=table if isinstance(table, dict) else {},
+            seen=str(body.get("seen", "")),
         )
     except SceneRefused as refused:
         faults = [{"place": fault.place, "text": fault.text} for fault in refused.faults]
         return JsonResponse({"error": str(refused), "faults": faults}, status=refused.status)
     except ChangedMeanwhile as changed:
         return JsonResponse({"error": str(changed), "seen": changed.seen}, status=changed.status)
-    address = reverse("setup-scene", args=[found.name])
-    return JsonResponse({"address": address, "remarks": remarks, **editing.state_of(found)})
+    address = reverse("setup-scene", args=[scene.name])
+    return JsonResponse({"address": address, "remarks": remarks, **editing.state_of(scene)})

@@ -53,10 +53,10 @@ class StationAdmin(admin.ModelAdmin):
     def enrol_view(self, request: HttpRequest, object_id: int) -> HttpResponse:
         """Explain enrolment; on POST create a code and show it once."""
         station = get_object_or_404(Station, pk=object_id)
-        shown = None
+        code = None
         if request.method == "POST":
             try:
-                shown = code_make(user=request.user, station=station)
+                code = code_make(user=request.user, station=station)
             except EvaError as fault:
                 messages.error(request, str(fault))
                 back = reverse("admin:stations_station_change", args=[object_id])
@@ -67,7 +67,7 @@ class StationAdmin(admin.ModelAdmin):
             "opts": self.opts,
             "station": station,
             "key": station.keys.filter(withdrawn_at=None).first(),
-            "shown": shown,
+            "shown": code,
             "minutes": int(VALID.total_seconds() // 60),
         }
         return render(request, "stations/admin_enrol.html", context)

@@ -147,11 +147,11 @@ def issue_command(
 
 def _require_no_table(row: Command, role: Role, vouched: Sequence[str]) -> None:
     """Raise NotAllowed if an operator passes a table reserved for administrators; the station checks it again."""
-    given = [key for key in TABLES if row.args.get(key) is not None and key not in vouched]
-    if given and role is not Role.ADMIN:
+    keys = [key for key in TABLES if row.args.get(key) is not None and key not in vouched]
+    if keys and role is not Role.ADMIN:
         raise NotAllowed(
             _TABLES_FOR_ADMINISTRATORS(
-                kind=row.kind, given=" and ".join(given), user=row.user, role=role.with_article
+                kind=row.kind, given=" and ".join(keys), user=row.user, role=role.with_article
             )
         )
 
@@ -191,8 +191,8 @@ def record_stop(
     at: datetime,
 ) -> Command:
     """Queue the row of a stop or halt that was sent at `at`; it is written when the database accepts it."""
-    given = {"station": station, "user": user, "kind": kind, "epoch": epoch, "issued_at": at}
-    row = Command(uuid=parse_command_uuid(uuid), holder=holder_of(user.get_username(), page), **given)
+    fields = {"station": station, "user": user, "kind": kind, "epoch": epoch, "issued_at": at}
+    row = Command(uuid=parse_command_uuid(uuid), holder=holder_of(user.get_username(), page), **fields)
     return _queue_record(row, answer)
 
 
@@ -281,9 +281,9 @@ def _send_and_wait(row: Command, command: messages.Command, waited: float) -> An
 def _stop(row: Command) -> Command:
     if row.kind != "estop":
         return _queue_record(row, request_stop(_message(row), row.station.name).result())
-    why, username = str(row.args.get("why", "pressed")), row.user.get_username()
+    reason, username = str(row.args.get("why", "pressed")), row.user.get_username()
     return _queue_record(
-        row, press_estop(station=row.station.name, username=username, why=why, uuid=row.uuid).result()
+        row, press_estop(station=row.station.name, username=username, why=reason, uuid=row.uuid).result()
     )
 
 
@@ -328,8 +328,8 @@ def _merged_fields(row: Command, first: Command) -> list[str]:
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"
     answer = _ANSWER if first.status in _UNANSWERED or carried_out or latched else ()
-    known = ("user", "args") if first.user_id is None and row.user_id is not None else ()
-    return [*answer, *known]
+    origin = ("user", "args") if first.user_id is None and row.user_id is not None else ()
+    return [*answer, *origin]
 
 
 def _first_or_own(row: Command) -> Command | None:

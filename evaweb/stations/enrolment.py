@@ -56,8 +56,8 @@ def code_make(*, user: Any, station: Station) -> Shown:
     )
     log.warning("%a has a code shown to enrol a computer as %s", user.get_username(), station.name)
     host, port = settings.EVA_GATE
-    shown = f"{settings.EVA_GATE_NAME or _named(host)}:{port}"
-    return Shown(code.text(), shown, port + 1, codes.fingerprint(code.lab), row.expires_at)
+    address = f"{settings.EVA_GATE_NAME or _named(host)}:{port}"
+    return Shown(code.text(), address, port + 1, codes.fingerprint(code.lab), row.expires_at)
 
 
 @transaction.atomic

@@ -55,7 +55,7 @@ class Keys:
     def poll(self) -> None:
         """Read the keys once; thread-safe."""
         try:
-            found = keys_allowed()
+            allowed = keys_allowed()
             self._failing = False
         except Error as error:
             if not self._failing:
@@ -64,9 +64,9 @@ class Keys:
             return
         finally:
             close_old_connections()
-        if found != self.list.now:
-            self.list.now = found
-            self._keep(found)
+        if allowed != self.list.now:
+            self.list.now = allowed
+            self._keep(allowed)
 
     def follow(self, ended: threading.Event) -> None:
         """Read the keys periodically until `ended` is set."""
@@ -76,8 +76,8 @@ class Keys:
             except Exception:  # otherwise this thread would end, and withdrawn keys would stay admitted
                 log.exception("who may connect is as it was")
 
-    def _keep(self, found: Allowed) -> None:
-        content = {key: sorted(names) for key, names in found.stations.items()}
+    def _keep(self, allowed: Allowed) -> None:
+        content = {key: sorted(names) for key, names in allowed.stations.items()}
         try:
             write_atomic(self._path, json.dumps(content).encode())
         except OSError as error:
@@ -85,8 +85,8 @@ class Keys:
 
     def _kept(self) -> Allowed:
         with suppress(OSError, ValueError, AttributeError, TypeError):
-            found = json.loads(self._path.read_text("utf-8"))
-            return Allowed(MappingProxyType({key: frozenset(names) for key, names in found.items()}))
+            by_key = json.loads(self._path.read_text("utf-8"))
+            return Allowed(MappingProxyType({key: frozenset(names) for key, names in by_key.items()}))
         return Allowed()
 
 

@@ -78,10 +78,10 @@ def claim(*, user: Any, station: Station, page: str) -> Lease:
     require_role(user, Role.OPERATOR)
     _require_active(station)
     holder = holder_of(user.get_username(), page)
-    held = _current_lease(station)
-    if held["holder"] not in ("", holder):
-        raise Conflict(_HELD_BY(who=holder_display_name(held["holder"]), station=station))
-    epoch = held["epoch"] if held["holder"] else _next_epoch(station, held)
+    lease = _current_lease(station)
+    if lease["holder"] not in ("", holder):
+        raise Conflict(_HELD_BY(who=holder_display_name(lease["holder"]), station=station))
+    epoch = lease["epoch"] if lease["holder"] else _next_epoch(station, lease)
     return _grant(user, station, holder, epoch, end_reason="expired")
 
 
@@ -108,23 +108,23 @@ def request_handover(*, user: Any, station: Station, page: str) -> LeaseRequest:
     """Ask the holder to hand the station over; a repeated request moves to the page that repeats it."""
     require_role(user, Role.OPERATOR)
     _require_active(station)
-    holder, held = holder_of(user.get_username(), page), _current_lease(station)["holder"]
-    if not held:
+    holder, current_holder = holder_of(user.get_username(), page), _current_lease(station)["holder"]
+    if not current_holder:
         raise Conflict(_NOBODY_HAS(station=station))
-    if held == holder:
+    if current_holder == holder:
         raise Conflict(_HELD_ALREADY(station=station))
-    asked, _ = LeaseRequest.objects.update_or_create(
+    request, _ = LeaseRequest.objects.update_or_create(
         station=station, user=user, answer=LeaseRequest.Answer.OPEN, defaults={"holder": holder}
     )
-    return asked
+    return request
 
 
 def withdraw_request(*, user: Any, station: Station) -> LeaseRequest:
     """Withdraw one's open request. Raises: NotFound if there is none."""
-    asked = LeaseRequest.objects.filter(station=station, user=user, answer=LeaseRequest.Answer.OPEN).first()
-    if asked is None:
+    request = LeaseRequest.objects.filter(station=station, user=user, answer=LeaseRequest.Answer.OPEN).first()
+    if request is None:
         raise NotFound(_NOT_ASKED(user=user.get_username(), station=station))
-    return _answered(asked, LeaseRequest.Answer.WITHDRAWN)
+    return _answered(request, LeaseRequest.Answer.WITHDRAWN)
 
 
 def decline_request(*, user: Any, station: Station, page: str, request: int) -> LeaseRequest:
@@ -136,13 +136,17 @@ def decline_request(*, user: Any, station: Station, page: str, request: int) -> 
 def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     """Hand the station over to the page that requested it, as the holder; a run continues without a pause."""
     own = _own(user, station, page)
-    asked = _open_request(station, request)
-    _require_commander(asked.user)
-    held = _current_lease(station)
-    if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
-        raise Conflict(_ENDED_MEANWHILE(who=holder_display_name(held["holder"]) or "nobody", station=station))
-    epoch = _next_epoch(station, held)
-    return _grant(asked.user, station, asked.holder, epoch, f"handed over to {asked.user}")
+    open_request = _open_request(station, request)
+    _require_commander(open_request.user)
+    lease = _current_lease(station)
+    if (lease["holder"], lease["epoch"]) != (own.holder, own.epoch):
+        raise Conflict(
+            _ENDED_MEANWHILE(who=holder_display_name(lease["holder"]) or "nobody", station=station)
+        )
+    epoch = _next_epoch(station, lease)
+    return _grant(
+        open_request.user, station, open_request.holder, epoch, f"handed over to {open_request.user}"
+    )
 
 
 def move(*, user: Any, station: Station, page: str) -> Lease:
@@ -152,14 +156,14 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
     """
     require_role(user, Role.OPERATOR)
     _require_active(station)
-    holder, held = holder_of(user.get_username(), page), _current_lease(station)
-    if held["holder"] == holder:
-        return _grant(user, station, holder, held["epoch"], end_reason="expired")
-    if not held["holder"].startswith(holder_of(user.get_username(), "")):
+    holder, lease = holder_of(user.get_username(), page), _current_lease(station)
+    if lease["holder"] == holder:
+        return _grant(user, station, holder, lease["epoch"], end_reason="expired")
+    if not lease["holder"].startswith(holder_of(user.get_username(), "")):
         raise Conflict(
-            _NO_PAGE_OF_YOURS(who=holder_display_name(held["holder"]) or "nobody", station=station)
+            _NO_PAGE_OF_YOURS(who=holder_display_name(lease["holder"]) or "nobody", station=station)
         )
-    return _grant(user, station, holder, _next_epoch(station, held), "moved to another page")
+    return _grant(user, station, holder, _next_epoch(station, lease), "moved to another page")
 
 
 def take_over(*, user: Any, station: Station, page: str, reason: str) -> Lease:
@@ -207,13 +211,13 @@ def _require_active(station: Station) -> None:
 
 def _current_lease(station: Station) -> dict[str, Any]:
     """Return the lease as the runtime reports it now: holder, epoch."""
-    held: dict[str, Any] = connection_to(station.name).status()["lease"]
-    return held
+    lease: dict[str, Any] = connection_to(station.name).status()["lease"]
+    return lease
 
 
-def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
+def _next_epoch(station: Station, lease: Mapping[str, Any]) -> int:
     """Return an epoch above all known to runtime and database: a runtime that lost its folder starts at zero."""
-    return 1 + max(int(held["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
+    return 1 + max(int(lease["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
 
 
 def _send_lease_command(
@@ -252,8 +256,8 @@ def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str
 
 def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: str) -> tuple[Lease, bool]:
     """Open the row of this lease and end all others; return it and whether anything changed."""
-    others = station.leases.filter(ended_at=None).exclude(epoch=epoch)
-    changed = others.update(ended_at=timezone.now(), end_reason=end_reason) > 0
+    other_leases = station.leases.filter(ended_at=None).exclude(epoch=epoch)
+    changed = other_leases.update(ended_at=timezone.now(), end_reason=end_reason) > 0
     lease, created = Lease.objects.get_or_create(
         station=station, epoch=epoch, defaults={"holder": holder, "boot": boot, "user": _user_of(holder)}
     )
@@ -289,18 +293,18 @@ def _own(user: Any, station: Station, page: str) -> Lease:
 
 
 def _open_request(station: Station, request: int) -> LeaseRequest:
-    found = LeaseRequest.objects.filter(pk=request, station=station).select_related("user").first()
-    if found is None:
+    row = LeaseRequest.objects.filter(pk=request, station=station).select_related("user").first()
+    if row is None:
         raise NotFound(_NO_SUCH_REQUEST(request=request, station=station))
-    if found.answer != LeaseRequest.Answer.OPEN:
-        raise Conflict(_ANSWERED_ALREADY(user=found.user, answer=found.get_answer_display()))
-    return found
+    if row.answer != LeaseRequest.Answer.OPEN:
+        raise Conflict(_ANSWERED_ALREADY(user=row.user, answer=row.get_answer_display()))
+    return row
 
 
-def _answered(asked: LeaseRequest, answer: LeaseRequest.Answer) -> LeaseRequest:
-    asked.answer, asked.answered_at = answer, timezone.now()
-    asked.save(update_fields=["answer", "answered_at"])
-    return asked
+def _answered(request: LeaseRequest, answer: LeaseRequest.Answer) -> LeaseRequest:
+    request.answer, request.answered_at = answer, timezone.now()
+    request.save(update_fields=["answer", "answered_at"])
+    return request
 
 
 def _end(lease: Lease, reason: str) -> bool:

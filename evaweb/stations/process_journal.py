@@ -109,6 +109,6 @@ def _resume(path: Path, take: Callable[[Sequence[bytes]], bool]) -> None:
         os.close(descriptor)
 
 
-def _put_aside(path: Path, why: str | None) -> None:
-    aside = path.replace(path.with_suffix(".refused"))
-    log.error("%s is put aside as %s: %s", path, aside.name, why)
+def _put_aside(path: Path, reason: str | None) -> None:
+    refused = path.replace(path.with_suffix(".refused"))
+    log.error("%s is put aside as %s: %s", path, refused.name, reason)

@@ -64,61 +64,63 @@ _JUDGED = ("milestones", "success")  # hidden ground truth: operators score befo
 
 def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, Any]:
     """Return a snapshot of the same structure in which revealing values are empty, with "veiled" set to True."""
-    shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
+    redacted = {key: snapshot[key] for key in _SHOWN if key in snapshot}
     covered = COVERED_AT_REST if snapshot.get("state") == SessionState.IDLE else COVERED
     reason = (snapshot.get("sentences") or {}).get("reason")
-    shown["reason"] = _reason(snapshot.get("reason"), reason, sight, covered)
-    shown |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
+    redacted["reason"] = _reason(snapshot.get("reason"), reason, sight, covered)
+    redacted |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
     if isinstance(snapshot.get("truth"), Mapping):
-        shown["truth"] = {key: said for key, said in snapshot["truth"].items() if key not in _JUDGED}
+        redacted["truth"] = {key: fact for key, fact in snapshot["truth"].items() if key not in _JUDGED}
     if (snapshot.get("state_is") or {}).get("preparing"):
-        shown["stage"] = "setting up"
+        redacted["stage"] = "setting up"
     if isinstance(snapshot.get("facts"), Mapping):
-        shown["facts"] = {key: value for key, value in snapshot["facts"].items() if key not in _FACTS}
+        redacted["facts"] = {key: value for key, value in snapshot["facts"].items() if key not in _FACTS}
     if isinstance(snapshot.get("control"), Mapping):
         control = snapshot["control"]
-        shown["control"] = _CONTROL_COVERED | {key: control[key] for key in _CONTROL if key in control}
+        redacted["control"] = _CONTROL_COVERED | {key: control[key] for key in _CONTROL if key in control}
     if isinstance(snapshot.get("recording"), Mapping):
-        shown["recording"] = dict(snapshot["recording"])
+        redacted["recording"] = dict(snapshot["recording"])
     if isinstance(snapshot.get("episode"), Mapping):
-        shown["episode"] = {key: snapshot["episode"][key] for key in ("uuid",) if key in snapshot["episode"]}
+        redacted["episode"] = {
+            key: snapshot["episode"][key] for key in ("uuid",) if key in snapshot["episode"]
+        }
     if isinstance(snapshot.get("sentences"), Mapping):
-        shown["sentences"] = _sentences(snapshot, shown)
-        if isinstance(shown["reason"], Sentence):
-            shown["sentences"]["reason"] = identity(shown["reason"])
-    return shown | {"veiled": True}
+        redacted["sentences"] = _sentences(snapshot, redacted)
+        if isinstance(redacted["reason"], Sentence):
+            redacted["sentences"]["reason"] = identity(redacted["reason"])
+    return redacted | {"veiled": True}
 
 
-def _reason(text: object, said: object, sight: Visibility, covered: str) -> str:
+def _reason(text: object, sentence: object, visibility: Visibility, covered: str) -> str:
     """Return the reason for the station's state as it may be shown, else `covered`.
 
     `said` holds the id and the arguments of the reason as a sentence.
     """
-    return sight.redact_text(
-        _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), covered
+    return visibility.redact_text(
+        _sentence({"text": str(text or ""), **(sentence if isinstance(sentence, Mapping) else {})}), covered
     )
 
 
-def _sentence(said: object) -> str:
+def _sentence(value: object) -> str:
     """Return a transmitted message as a Sentence; plain text if it has no valid id."""
-    found = said if isinstance(said, Mapping) else {"text": str(said or "")}
-    text = str(found.get("text") or "")
+    fields = value if isinstance(value, Mapping) else {"text": str(value or "")}
+    text = str(fields.get("text") or "")
     try:
-        return from_wire(text, found.get("id") or "", found.get("arguments") or {})
+        return from_wire(text, fields.get("id") or "", fields.get("arguments") or {})
     except ValueError:
         return text
 
 
-def _sentences(snapshot: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[str, Any]:
+def _sentences(snapshot: Mapping[str, Any], redacted: Mapping[str, Any]) -> dict[str, Any]:
     """Return ids and arguments of the sentences whose text is shown unchanged.
 
     A sentence is left out if its arguments contain anything beyond that text.
     """
-    before, now = texts(snapshot), texts(shown)
+    before, now = texts(snapshot), texts(redacted)
     return {
-        path: one
-        for path, one in snapshot["sentences"].items()
-        if path in now and now[path] == before.get(path) and shows(now[path], one["arguments"])
+        path: reference
+        for path, reference in snapshot["sentences"].items()
+        if path in now and now[path] == before.get(path) and shows(now[path], reference["arguments"])
     }
 
 
@@ -137,12 +139,12 @@ def redact_events(
 
     Events are renumbered by their times [us], increasing from `last`: gaps would reveal how many are hidden.
     """
-    found = []
+    events = []
     for row in rows:
-        if (shown := _event(row, sight)) is not None:
+        if (event := _event(row, sight)) is not None:
             last = max(int(1e6 * float(row.get("time") or 0.0)), last + 1)
-            found.append({**shown, "number": last})
-    return found
+            events.append({**event, "number": last})
+    return events
 
 
 def redact_joints(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -155,18 +157,24 @@ def redact_answer(data: Mapping[str, Any]) -> dict[str, Any]:
     return {key: data[key] for key in ("episode", "bench") if key in data}
 
 
-def _event(row: Mapping[str, Any], sight: Visibility) -> dict[str, Any] | None:
+def _event(row: Mapping[str, Any], visibility: Visibility) -> dict[str, Any] | None:
     kind, text = row.get("kind"), str(row.get("text") or "")
-    kept = {key: row[key] for key in ("time", "wall") if key in row}
+    times = {key: row[key] for key in ("time", "wall") if key in row}
     reason = _sentence((row.get("arguments") or {}).get("reason"))
     if kind == "command":  # "stop by ann: accepted", "setup by ann: refused, the reason"
-        said, _, rest = text.partition(", ")
-        text = f"{said}, {sight.redact_text(reason if reason == rest else rest, COVERED)}" if rest else said
+        head, _, tail = text.partition(", ")
+        text = (
+            f"{head}, {visibility.redact_text(reason if reason == tail else tail, COVERED)}" if tail else head
+        )
     elif kind == "state":  # "running -> holding: the reason"
-        moved, _, rest = text.partition(": ")
-        text = f"{moved}: {sight.redact_text(reason if reason == rest else rest, COVERED)}" if rest else moved
+        moved, _, tail = text.partition(": ")
+        text = (
+            f"{moved}: {visibility.redact_text(reason if reason == tail else tail, COVERED)}"
+            if tail
+            else moved
+        )
     elif kind in ("episode_opened", "episode_closed"):
         text = str(kind).replace("_", " ")
     elif kind not in _EVENTS:
         return None
-    return {**kept, "kind": kind, "text": text, "data": {}, **_identity(row, text)}
+    return {**times, "kind": kind, "text": text, "data": {}, **_identity(row, text)}

@@ -92,11 +92,11 @@ class RequestCoalescer(Generic[T]):
             try:
                 answer = flight.work()
             except BaseException as fault:
-                done, flight = flight, self._next(place)
-                done.answer.set_exception(fault)
+                completed, flight = flight, self._next(place)
+                completed.answer.set_exception(fault)
             else:
-                done, flight = flight, self._next(place)
-                done.answer.set_result(answer)
+                completed, flight = flight, self._next(place)
+                completed.answer.set_result(answer)
 
     def _next(self, place: tuple[str, Hashable]) -> _PendingRequest[T] | None:
         """Remove the finished request, so that no caller joins it, and return the waiting one."""
@@ -113,9 +113,9 @@ class RequestCoalescer(Generic[T]):
 
 
 def _joined(flights: list[_PendingRequest[T]], flight: _PendingRequest[T], shared: bool) -> Future[T]:
-    for one in flights:
-        if one.identity == flight.identity:
-            return one.answer
+    for joined in flights:
+        if joined.identity == flight.identity:
+            return joined.answer
     if len(flights) == 1:
         flights.append(flight)
     return flights[0 if shared else 1].answer

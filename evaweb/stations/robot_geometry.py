@@ -46,13 +46,13 @@ class DrawnRobot:
         row is NaN.
         """
         joints = np.asarray(q, np.float64)
-        found = self._links.result().poses(joints) if self.compiled else self._placed(joints)
-        found[~np.isfinite(joints).all(axis=-1)] = np.nan
-        return found
+        matrices = self._links.result().poses(joints) if self.compiled else self._placed(joints)
+        matrices[~np.isfinite(joints).all(axis=-1)] = np.nan
+        return matrices
 
     def _placed(self, joints: NDArray[np.float64]) -> NDArray[np.float32]:
-        found = np.swapaxes(self.scene.poses(joints), -1, -2)
-        return found.reshape(*found.shape[:-2], 16).astype(np.float32)
+        matrices = np.swapaxes(self.scene.poses(joints), -1, -2)
+        return matrices.reshape(*matrices.shape[:-2], 16).astype(np.float32)
 
     @property
     def compiled(self) -> bool:
@@ -61,13 +61,13 @@ class DrawnRobot:
 
     def fingertip_positions(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the fingertips for part poses `links` [..., P, 16]: float32 [..., arms, 3] in the world [m]."""
-        found = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
+        positions = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
         for index, arm in enumerate(self.robot.arms):
             part = links[..., self.tip_part(arm), :].reshape(
                 *links.shape[:-2], 4, 4
             )  # column-major, so this is the transpose
-            found[..., index, :] = (tip_of(arm)[:, 3] @ part)[..., :3]
-        return found
+            positions[..., index, :] = (tip_of(arm)[:, 3] @ part)[..., :3]
+        return positions
 
     def tip_part(self, arm: robots.Group) -> int:
         """Return the index of the part that is the arm's end effector and carries its fingertips."""

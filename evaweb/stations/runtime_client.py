@@ -141,9 +141,9 @@ class StationConnection:
     def _link(self) -> str:
         """Return the gate's report on the link to a station on another computer, "" if there is none."""
         try:
-            told = self.endpoints.read("link")
-            since = localtime(datetime.fromtimestamp(float(told["since"]), UTC))
-            return _LINK(name=self.name, since=f"{since:%H:%M:%S}", why=str(told["why"]))
+            fields = self.endpoints.read("link")
+            since = localtime(datetime.fromtimestamp(float(fields["since"]), UTC))
+            return _LINK(name=self.name, since=f"{since:%H:%M:%S}", why=str(fields["why"]))
         except (TransportError, KeyError, ValueError, OverflowError, OSError):
             return ""
 

@@ -24,11 +24,11 @@ def station_list(*, all_of_them: bool = False) -> QuerySet[Station]:
 
 def station_get(*, name: str) -> Station:
     """Return the station of that name. Raises: NotFound, which lists the existing ones."""
-    found = Station.objects.filter(name=name).first() if is_text(name) else None
-    if found is None:
-        known = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
-        raise NotFound(_NO_SUCH_STATION(name=name, known=known))
-    return found
+    station = Station.objects.filter(name=name).first() if is_text(name) else None
+    if station is None:
+        names = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
+        raise NotFound(_NO_SUCH_STATION(name=name, known=names))
+    return station
 
 
 def lease_open(*, station: Station) -> Lease | None:
@@ -48,5 +48,5 @@ def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
 
 def last_set_up(*, station: Station) -> UUID | None:
     """Return the uuid of the newest set-up that may have been carried out, None if there is none."""
-    asked = station.commands.filter(kind="setup").exclude(status__in=NOT_CARRIED_OUT)
-    return asked.order_by("-issued_at").values_list("pk", flat=True).first()
+    setups = station.commands.filter(kind="setup").exclude(status__in=NOT_CARRIED_OUT)
+    return setups.order_by("-issued_at").values_list("pk", flat=True).first()

@@ -81,23 +81,23 @@ class StopRecorder:
         with self._news:
             self._written = {key: at for key, at in self._written.items() if now - at < _APART_S}
             due = [key for key in self._waiting if all_of_them or key not in self._written]
-            taken = [(key, *self._waiting.pop(key)) for key in due]
+            due_rows = [(key, *self._waiting.pop(key)) for key in due]
             self._written |= dict.fromkeys(due, now)
             wait = min((self._written[key] + _APART_S - now for key in self._waiting), default=None)
             waiting = [row for key, row in self._fresh if key in self._waiting]
             self._fresh.clear()
         self._write_ahead(waiting)
-        again = [one for one in taken if not self._try_hand_on(*one[1:])]
-        if again:
-            self._take_back(again)
+        failed = [entry for entry in due_rows if not self._try_hand_on(*entry[1:])]
+        if failed:
+            self._take_back(failed)
             return wait or _APART_S
         if wait is None:
             self._write_ahead([])
         return wait
 
-    def _take_back(self, again: Sequence[tuple[_Key, Command, int]]) -> None:
+    def _take_back(self, failed: Sequence[tuple[_Key, Command, int]]) -> None:
         with self._news:
-            for key, row, times in again:
+            for key, row, times in failed:
                 newer, since = self._waiting.get(key, (row, 0))
                 self._waiting[key] = (newer, since + times)
             while len(self._waiting) > _MOST:

@@ -111,9 +111,9 @@ def send_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> An
     try:
         ack = connection_to(station).request_urgent(command, "guard", "estop", _estop_s())
         answer = replace(answer_of(ack), uuid=str(uuid))
-        said = answer.data.get("station", station)
-        if said != station:  # another station reuses the socket address of this one, which was killed
-            reason = _STOP_BY_HAND(why=_ANOTHER_ANSWERED(other=said, station=station))
+        answering = answer.data.get("station", station)
+        if answering != station:  # another station reuses the socket address of this one, which was killed
+            reason = _STOP_BY_HAND(why=_ANOTHER_ANSWERED(other=answering, station=station))
             return Answer(CommandStatus.FAILED, reason, [], answer.data)
     except NoAnswer as fault:
         answer = Answer(CommandStatus.UNKNOWN, _STOP_BY_HAND(why=fault))

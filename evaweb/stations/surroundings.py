@@ -79,33 +79,33 @@ def bounds(visual: Visual, part: Float64) -> Box:
     return Box(middle - reach, middle + reach)
 
 
-def _at_poses(looks: DrawnRobot) -> list[list[Box]]:
+def _at_poses(drawn: DrawnRobot) -> list[list[Box]]:
     """Return the boxes of the robot's shapes in each of its named poses, home first."""
-    named = looks.robot.poses
-    found = []
+    named = drawn.robot.poses
+    boxes = []
     for name in sorted(named, key=lambda name: name != "home"):
-        parts = looks.scene.poses(named[name])
-        found.append([bounds(visual, parts[visual.part]) for visual in looks.scene.visuals])
-    return found
+        parts = drawn.scene.poses(named[name])
+        boxes.append([bounds(visual, parts[visual.part]) for visual in drawn.scene.visuals])
+    return boxes
 
 
-def _roots(looks: DrawnRobot) -> list[Float64]:
+def _roots(drawn: DrawnRobot) -> list[Float64]:
     """Return the positions of the roots of the robot's copies of its URDF, [3] each."""
-    root = urdf.read(looks.robot.urdf).root
-    poses = looks.scene.poses(looks.robot.poses["home"])
-    return [poses[part, :3, 3] for part in looks.scene.parts_showing(root)]
+    root = urdf.read(drawn.robot.urdf).root
+    poses = drawn.scene.poses(drawn.robot.poses["home"])
+    return [poses[part, :3, 3] for part in drawn.scene.parts_showing(root)]
 
 
-def _floor(looks: DrawnRobot, home: Sequence[Box]) -> float | None:
+def _floor(drawn: DrawnRobot, home: Sequence[Box]) -> float | None:
     """Return the height of the floor on which the robot stands [m]; None for a robot on a table."""
-    lowest = min([*(box.low[2] for box in home), *(root[2] for root in _roots(looks))], default=0.0)
+    lowest = min([*(box.low[2] for box in home), *(root[2] for root in _roots(drawn))], default=0.0)
     return float(lowest) if lowest < _BELOW else None
 
 
-def _table(looks: DrawnRobot, home: Sequence[Box]) -> Rectangle:
+def _table(drawn: DrawnRobot, home: Sequence[Box]) -> Rectangle:
     """Return the table's x from, to, y from, to [m]: large enough for bases on it, clear of a body next to it."""
     x_from, x_to, y_from, y_to = _LEAST_TABLE
-    for x, y, z in _roots(looks):
+    for x, y, z in _roots(drawn):
         if z > _BELOW:
             x_from, x_to = min(x_from, x - _FOOT), max(x_to, x + _FOOT)
             y_from, y_to = min(y_from, y - _FOOT), max(y_to, y + _FOOT)
@@ -128,8 +128,8 @@ def _clear_of(table: Rectangle, box: Box) -> Rectangle:
         (x_from, x_to, float(y_high), y_to),
         (x_from, x_to, y_from, float(y_low)),
     ]
-    kept = [cut for cut in cuts if _contains(cut, AREA)]
-    return max(kept, key=lambda cut: (cut[1] - cut[0]) * (cut[3] - cut[2]), default=table)
+    usable = [cut for cut in cuts if _contains(cut, AREA)]
+    return max(usable, key=lambda cut: (cut[1] - cut[0]) * (cut[3] - cut[2]), default=table)
 
 
 def _contains(table: Rectangle, area: Rectangle) -> bool:
@@ -148,10 +148,10 @@ def _drawn(table: Rectangle, floor: float | None) -> dict[str, Any]:
     }
 
 
-def _mounts(looks: DrawnRobot, table: Rectangle, floor: float | None) -> list[dict[str, Any]]:
+def _mounts(drawn: DrawnRobot, table: Rectangle, floor: float | None) -> list[dict[str, Any]]:
     """Return a column under each base above the table; bases close to each other share one."""
     near: list[list[Float64]] = []
-    for root in _roots(looks):
+    for root in _roots(drawn):
         if root[2] < _ABOVE:
             continue
         shared = [many for many in near if np.linalg.norm(many[0][:2] - root[:2]) < _ONE_MOUNT]
@@ -169,12 +169,12 @@ def _mount(roots: Float64, table: Rectangle, floor: float | None) -> dict[str, A
     return {"at": [x, y], "from": 0.0 if on_table else floor, "to": top, "radius": _RADIUS, "colour": _STEEL}
 
 
-def _ahead(looks: DrawnRobot) -> list[float]:
+def _ahead(drawn: DrawnRobot) -> list[float]:
     """Return the horizontal unit vector [2] from the bases to the middle of AREA."""
     x_from, x_to, y_from, y_to = AREA
-    way = np.array([x_from + x_to, y_from + y_to]) / 2 - np.mean(_roots(looks), axis=0)[:2]
-    length = float(np.linalg.norm(way))
-    return [0.0, 1.0] if length < _NOWHERE else (way / length).tolist()
+    direction = np.array([x_from + x_to, y_from + y_to]) / 2 - np.mean(_roots(drawn), axis=0)[:2]
+    length = float(np.linalg.norm(direction))
+    return [0.0, 1.0] if length < _NOWHERE else (direction / length).tolist()
 
 
 def _view(boxes: Sequence[Box]) -> dict[str, list[float]]:

@@ -176,8 +176,8 @@ def _path(name: str) -> Path:
 def _document(row: Command) -> dict[str, Any]:
     times = {name: at.isoformat() for name in _TIMES if (at := getattr(row, name))}
     user = row.user.get_username() if row.user else ""
-    said = {"uuid": str(row.uuid), "station": row.station.name, "user": user}
-    return said | {name: getattr(row, name) for name in _PLAIN} | times
+    fields = {"uuid": str(row.uuid), "station": row.station.name, "user": user}
+    return fields | {name: getattr(row, name) for name in _PLAIN} | times
 
 
 def _row(document: dict[str, Any]) -> Command:

@@ -17,10 +17,10 @@ def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
     """Return the scene of a station; its robot has the groups ?groups=a,b, as its runtime reports them."""
     try:
         station = station_get(name=name)
-        found = geometry.scene_geometry(station.robot, _groups(request), simulated=station.simulated)
+        document = geometry.scene_geometry(station.robot, _groups(request), simulated=station.simulated)
     except NotFound as error:
         raise Http404(str(error)) from None
-    return JsonResponse(found)
+    return JsonResponse(document)
 
 
 @require_safe
@@ -33,8 +33,8 @@ def robot_geometry(request: HttpRequest, robot: str) -> JsonResponse:
 
 
 def _groups(request: HttpRequest) -> list[str] | None:
-    given = request.GET.get("groups", "")
-    return given.split(",") if given else None
+    text = request.GET.get("groups", "")
+    return text.split(",") if text else None
 
 
 def _etag(request: HttpRequest, robot: str, digest: str) -> str:

@@ -106,21 +106,21 @@ class Boundary:
         if not self.looks:
             raise StatisticsError("a design needs at least one look")
         better, worse = [], []
-        for look, mass in self._stopping_mass((p_first, p_second)):
+        for table, mass in self._stopping_mass((p_first, p_second)):
             first, second = np.indices(mass.shape)
-            ahead = (first * look.second > second * look.first) & (self.margin is None)
+            ahead = (first * table.second > second * table.first) & (self.margin is None)
             better.append(float(mass[ahead].sum()))
             worse.append(float(mass[~ahead].sum()))
-        stops = [one + other for one, other in zip(better, worse, strict=True)]
-        trials = [look.first + look.second for look in self.looks]
-        rest = 1.0 - math.fsum(stops)
+        stops = [won + lost for won, lost in zip(better, worse, strict=True)]
+        trials = [table.first + table.second for table in self.looks]
+        unstopped = 1.0 - math.fsum(stops)
         so_far, median = 0.0, trials[-1]
         for count, stop in zip(trials, stops, strict=True):
             so_far += stop
             if so_far >= 0.5:
                 median = count
                 break
-        mean = math.fsum(c * s for c, s in zip(trials, stops, strict=True)) + rest * trials[-1]
+        mean = math.fsum(c * s for c, s in zip(trials, stops, strict=True)) + unstopped * trials[-1]
         return OperatingCharacteristics(math.fsum(better), math.fsum(worse), median, mean, tuple(stops))
 
     def error(self) -> tuple[float, float]:
@@ -136,8 +136,8 @@ class Boundary:
 
         def turned(angles: NDArray[np.float64]) -> NDArray[np.float64]:
             null = _Null(self.margin, angles)
-            found = np.sum([null.total(*tables) for tables in wrong], axis=0)
-            return np.asarray(np.arcsin(np.sqrt(np.clip(found, 0.0, 1.0))))
+            errors = np.sum([null.total(*tables) for tables in wrong], axis=0)
+            return np.asarray(np.arcsin(np.sqrt(np.clip(errors, 0.0, 1.0))))
 
         angles = np.linspace(_END, math.pi / 2 - _END, _FINE)
         at, allowed = turned(angles), math.asin(math.sqrt(self.alpha))
@@ -166,14 +166,14 @@ class Boundary:
 
         if self.margin is not None:
             return [
-                (np.nonzero(mass), mass[np.nonzero(mass)], (look.first, look.second))
-                for look, mass in self._stopping_mass((0.5, 0.5))
+                (np.nonzero(mass), mass[np.nonzero(mass)], (table.first, table.second))
+                for table, mass in self._stopping_mass((0.5, 0.5))
             ]
         gone, trials = np.zeros(1), 0
-        for look, mass in self._stopping_mass((0.5, 0.5)):
-            for _ in range(look.first + look.second - trials):
+        for table, mass in self._stopping_mass((0.5, 0.5)):
+            for _ in range(table.first + table.second - trials):
                 gone = 0.5 * (np.append(gone, 0.0) + np.append(0.0, gone))
-            trials = look.first + look.second
+            trials = table.first + table.second
             gone += np.bincount(
                 np.indices(mass.shape).sum(axis=0).ravel(), mass.ravel(), minlength=trials + 1
             )
@@ -186,16 +186,16 @@ class Boundary:
         import numpy as np
 
         alive, before = np.ones((1, 1)), (0, 0)
-        for look, region in zip(self.looks, self.regions, strict=True):
-            alive = _add_trials(alive, look.first - before[0], look.second - before[1], rates)
-            before = (look.first, look.second)
-            yield look, np.where(region, alive, 0.0)
+        for table, region in zip(self.looks, self.regions, strict=True):
+            alive = _add_trials(alive, table.first - before[0], table.second - before[1], rates)
+            before = (table.first, table.second)
+            yield table, np.where(region, alive, 0.0)
             alive = np.where(region, 0.0, alive)
 
     @cached_property
     def regions(self) -> list[NDArray[np.bool_]]:
         """Stopping region of each look: bool [first + 1, second + 1]."""
-        return [_region(look, self.margin) for look in self.looks]
+        return [_region(table, self.margin) for table in self.looks]
 
 
 def boundary(
@@ -229,16 +229,16 @@ def _boundary(
         raise StatisticsError(f"margin = {margin}; allowed: above 0 and below 1")
     null = _Null(margin, np.linspace(0, math.pi / 2, _RATES + 2)[1:-1])
     spent, total = np.zeros(_RATES), sum(counts[-1])
-    alive, before, found = np.ones((1, 1)), (0, 0), []
+    alive, before, tables = np.ones((1, 1)), (0, 0), []
     for first, second in counts:
         alive = _add_trials(alive, first - before[0], second - before[1], (0.5, 0.5))
         before = (first, second)
         most = _SAFETY * alpha * ((first + second) / total) ** SHAPES[shape]
         least, spent = _least_extreme(alive, (first, second), null, spent, most)
-        look = StoppingTable(first, second, least)
-        alive = np.where(_region(look, margin), 0.0, alive)
-        found.append(look)
-    return Boundary(tuple(found), alpha, margin)
+        table = StoppingTable(first, second, least)
+        alive = np.where(_region(table, margin), 0.0, alive)
+        tables.append(table)
+    return Boundary(tuple(tables), alpha, margin)
 
 
 def pair_counts(pairs: int, at: Sequence[int] | None = None) -> list[tuple[int, int]]:
@@ -291,11 +291,15 @@ class _Null:
         if self.margin is None:  # only total successes matter: one exponential per distinct total
             numbers, where = np.unique(cells[0] + cells[1], return_inverse=True)
             return np.asarray(even[:, None] * self.powers(numbers, sum(trials))[where])
-        one, not_one, other, not_other = self._logs
+        log_first, log_not_first, log_second, log_not_second = self._logs
         (a, b), (n, m) = (of[:, None].astype(float) for of in cells), trials
         with np.errstate(divide="ignore"):
             weights = np.log(even)[:, None]
-        return np.asarray(np.exp(weights + a * one + (n - a) * not_one + b * other + (m - b) * not_other))
+        return np.asarray(
+            np.exp(
+                weights + a * log_first + (n - a) * log_not_first + b * log_second + (m - b) * log_not_second
+            )
+        )
 
     def powers(self, successes: NDArray[Any], trials: int) -> NDArray[np.float64]:
         """Return the likelihood of these total successes at each common rate, relative to a rate of 0.5: float64 [.,
@@ -303,9 +307,9 @@ class _Null:
         """
         import numpy as np
 
-        one, not_one = self._logs[:2]
+        log_first, log_not_first = self._logs[:2]
         number = successes[:, None].astype(float)
-        return np.asarray(np.exp(number * one + (trials - number) * not_one))
+        return np.asarray(np.exp(number * log_first + (trials - number) * log_not_first))
 
     def total(
         self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
@@ -320,19 +324,19 @@ class _Null:
         return total
 
 
-def _checked(looks: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    if not looks:
+def _checked(counts: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    if not counts:
         raise StatisticsError("a design needs at least one look")
     before = (0, 0)
-    for look in looks:
-        if min(look) < 1 or max(look) > MOST:
+    for count in counts:
+        if min(count) < 1 or max(count) > MOST:
             raise StatisticsError(
-                f"a look after {look[0]} and {look[1]} trials; allowed: 1 to {MOST} of each arm"
+                f"a look after {count[0]} and {count[1]} trials; allowed: 1 to {MOST} of each arm"
             )
-        if look[0] < before[0] or look[1] < before[1] or tuple(look) == before:
-            raise StatisticsError(f"a look after {look[0]} and {look[1]} trials follows one after {before}")
-        before = (look[0], look[1])
-    return [(first, second) for first, second in looks]
+        if count[0] < before[0] or count[1] < before[1] or tuple(count) == before:
+            raise StatisticsError(f"a look after {count[0]} and {count[1]} trials follows one after {before}")
+        before = (count[0], count[1])
+    return [(first, second) for first, second in counts]
 
 
 def _add_trials(
@@ -354,7 +358,7 @@ def _add_trials(
 
 def _least_extreme(
     alive: NDArray[np.float64],
-    look: tuple[int, int],
+    trials: tuple[int, int],
     null: _Null,
     spent: NDArray[np.float64],
     most: float,
@@ -365,7 +369,7 @@ def _least_extreme(
     """
     import numpy as np
 
-    degree = _degrees(*look, null.margin)
+    degree = _degrees(*trials, null.margin)
     reached = np.flatnonzero((degree > 0) & (alive > 0))
     order = reached[np.argsort(-degree.ravel()[reached], kind="stable")]
     levels = degree.ravel()[order]
@@ -374,22 +378,22 @@ def _least_extreme(
     )  # at the last table of each group of equally extreme ones
     if null.margin is None:
         numbers = np.add(*np.unravel_index(order, alive.shape))
-        taken, spent = _within(
-            null, sum(look), numbers, alive.ravel()[order], np.flatnonzero(ends), spent, most
+        number, spent = _within(
+            null, sum(trials), numbers, alive.ravel()[order], np.flatnonzero(ends), spent, most
         )
-        return _least(order[:taken], levels, alive.shape, look, None) if taken else None, spent
+        return _least(order[:number], levels, alive.shape, trials, None) if number else None, spent
     least: tuple[int, int] | None = None
     so_far = spent
     for start in range(0, len(order), _CELLS):
         part = slice(start, start + _CELLS)
         cells = np.unravel_index(order[part], alive.shape)
-        errors = so_far + np.cumsum(null.mass(cells, alive[cells], look), axis=0)
+        errors = so_far + np.cumsum(null.mass(cells, alive[cells], trials), axis=0)
         within = errors.max(axis=1) <= most
         allowed = len(within) if within.all() else int(np.argmin(within))
         whole = np.flatnonzero(ends[part][:allowed])
         if len(whole):
             spent = errors[whole[-1]]
-            least = _least(order[: start + whole[-1] + 1], levels, alive.shape, look, null.margin)
+            least = _least(order[: start + whole[-1] + 1], levels, alive.shape, trials, null.margin)
         if allowed < len(within):
             break
         so_far = errors[-1]
@@ -430,7 +434,7 @@ def _least(
     order: NDArray[np.intp],
     levels: NDArray[np.float64],
     shape: tuple[int, ...],
-    look: tuple[int, int],
+    trials: tuple[int, int],
     margin: float | None,
 ) -> tuple[int, int]:
     """Return the least extreme table in `order`, decided exactly among those that equal the last one up to rounding."""
@@ -440,33 +444,35 @@ def _least(
     tables = [tuple(int(at) for at in np.unravel_index(index, shape)) for index in alike]
 
     def degree(table: tuple[int, ...]) -> Fraction:
-        return Fraction(*extremeness_of(table[0], look[0], table[1], look[1], margin))
+        return Fraction(*extremeness_of(table[0], trials[0], table[1], trials[1], margin))
 
     first, second = min(sorted(tables), key=degree)
     return first, second
 
 
-def _at_least(first: int, second: int, look: StoppingTable, margin: float | None) -> bool:
-    assert look.least is not None
-    over, under = extremeness_of(first, look.first, second, look.second, margin)
-    least_over, least_under = extremeness_of(look.least[0], look.first, look.least[1], look.second, margin)
+def _at_least(first: int, second: int, table: StoppingTable, margin: float | None) -> bool:
+    assert table.least is not None
+    over, under = extremeness_of(first, table.first, second, table.second, margin)
+    least_over, least_under = extremeness_of(
+        table.least[0], table.first, table.least[1], table.second, margin
+    )
     return over * least_under >= least_over * under
 
 
-def _region(look: StoppingTable, margin: float | None) -> NDArray[np.bool_]:
+def _region(table: StoppingTable, margin: float | None) -> NDArray[np.bool_]:
     """Return the stopping region of a look: bool [first + 1, second + 1].
 
     Tables that rounding could misclassify are compared exactly, as integers.
     """
     import numpy as np
 
-    degree = _degrees(look.first, look.second, margin)
-    if look.least is None:
+    degree = _degrees(table.first, table.second, margin)
+    if table.least is None:
         return np.zeros(degree.shape, dtype=bool)
-    level = degree[look.least]
+    level = degree[table.least]
     region = degree > level * (1 + _TIE)
     for first, second in np.argwhere(np.abs(degree - level) <= _TIE * level):
-        region[first, second] = _at_least(int(first), int(second), look, margin)
+        region[first, second] = _at_least(int(first), int(second), table, margin)
     return np.asarray(region)
 
 

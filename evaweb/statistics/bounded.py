@@ -43,19 +43,19 @@ def bounded_mean(
     empty = [name for name, outcomes in strata.items() if not len(outcomes)]
     if not strata or empty:
         raise StatisticsError(f"{empty[0]!r} has no trial" if empty else "no trial")
-    given = [np.asarray(outcomes, dtype=float) for _, outcomes in sorted(strata.items())]
-    wrong = [float(one) for outcomes in given for one in outcomes if not low <= one <= high]
+    samples = [np.asarray(outcomes, dtype=float) for _, outcomes in sorted(strata.items())]
+    wrong = [float(outcome) for outcomes in samples for outcome in outcomes if not low <= outcome <= high]
     if wrong:
         raise StatisticsError(f"an outcome of {wrong[0]}; allowed: {low:g} to {high:g}")
     chance = np.random.default_rng(seed)
     lower, upper = np.zeros(draws), np.zeros(draws)
-    for outcomes in given:
+    for outcomes in samples:
         levels, counts = np.unique((outcomes - low) / (high - low), return_counts=True)
         weights, more = chance.gamma(counts, size=(draws, len(levels))), chance.exponential(size=draws)
         total, drawn = weights.sum(axis=1) + more, weights @ levels
-        lower += drawn / total / len(given)
-        upper += (drawn + more) / total / len(given)
-    value = float(np.mean([outcomes.mean() for outcomes in given]))
+        lower += drawn / total / len(samples)
+        upper += (drawn + more) / total / len(samples)
+    value = float(np.mean([outcomes.mean() for outcomes in samples]))
     ends = (
         float(np.quantile(side, share))
         for side, share in ((lower, (1 - level) / 2), (upper, (1 + level) / 2))

@@ -57,16 +57,16 @@ def calibration(pairs: Sequence[tuple[float, bool]]) -> Calibration:
         Bin(
             k / BINS,
             (k + 1) / BINS,
-            len(held),
-            sum(p for p, _ in held) / len(held),
-            sum(true for _, true in held),
+            len(members),
+            sum(p for p, _ in members) / len(members),
+            sum(true for _, true in members),
         )
-        for k, held in enumerate(binned)
-        if held
+        for k, members in enumerate(binned)
+        if members
     )
     return Calibration(
         n,
         sum((probability - true) ** 2 for probability, true in pairs) / n,
-        sum(abs(held.n * held.probability - held.true) for held in bins) / n,
+        sum(abs(members.n * members.probability - members.true) for members in bins) / n,
         bins,
     )

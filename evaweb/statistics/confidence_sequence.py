@@ -51,25 +51,25 @@ def _lower_bound(differences: Sequence[float], alpha: float) -> float:
     levels, which = np.unique(np.asarray(differences, dtype=float) + 1, return_inverse=True)
     if not len(levels) or levels[-1] == 0:
         return -1.0
-    seen = np.cumsum(which[:, None] == np.arange(len(levels)), axis=0, dtype=float)
-    wanted = math.log(2 / alpha)
+    counts = np.cumsum(which[:, None] == np.arange(len(levels)), axis=0, dtype=float)
+    threshold = math.log(2 / alpha)
 
     def beyond(mean: float) -> float:
-        return _max_log_wealth(levels / (1 + mean), seen) - wanted
+        return _max_log_wealth(levels / (1 + mean), counts) - threshold
 
     # The log wealth falls as the mean rises, and is at most 0 at a mean of 1: there is at most one root.
     nearest = -1 + _ENOUGH
     return float(brentq(beyond, nearest, 1.0, xtol=_ENOUGH)) if beyond(nearest) > 0 else -1.0
 
 
-def _max_log_wealth(shares: NDArray[np.float64], seen: NDArray[np.float64]) -> float:
+def _max_log_wealth(shares: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
     """Return the largest log wealth that the gamblers together had after any pair.
 
-    `shares` [levels] are the outcome levels divided by the mean, both counted from -1; `seen` [pairs, levels] is the
+    `shares` [levels] are the outcome levels divided by the mean, both counted from -1; `counts` [pairs, levels] is the
     cumulative count of each level.
     """
     import numpy as np
 
-    worths = seen @ np.log1p(np.array(BET_FRACTIONS) * (shares[:, None] - 1))
+    worths = counts @ np.log1p(np.array(BET_FRACTIONS) * (shares[:, None] - 1))
     most = float(worths.max())
     return most + math.log(float(np.exp(worths - most).sum(axis=1).max()) / len(BET_FRACTIONS))

@@ -61,8 +61,10 @@ def design_power(
     shape, at = ("late", (pairs,)) if rule == FIXED else (rule, looks)  # unused with a single look
     # With a margin, a boundary tests its second arm.
     rates = (p_first, p_second) if margin is None else (p_second, p_first)
-    found = _boundary(shape, pairs, alpha, margin, at).operating_characteristics(*rates)
-    return DesignPower(rule, pairs, found.power, found.mean / 2, found.median // 2)
+    characteristics = _boundary(shape, pairs, alpha, margin, at).operating_characteristics(*rates)
+    return DesignPower(
+        rule, pairs, characteristics.power, characteristics.mean / 2, characteristics.median // 2
+    )
 
 
 def pairs_needed(
@@ -75,19 +77,19 @@ def pairs_needed(
         raise StatisticsError(f"p_first = p_second = {p_first}: there is no difference to be found")
     low, reached = 0, 0.0
     high = min(MOST, trials_needed(p_first, p_second, power, alpha))
-    while (found := design_power(rule, high, p_first, p_second, alpha)).power < power:
+    while (result := design_power(rule, high, p_first, p_second, alpha)).power < power:
         if high == MOST:
             return None
-        low, reached, high = high, found.power, min(MOST, math.ceil(1.15 * high))
+        low, reached, high = high, result.power, min(MOST, math.ceil(1.15 * high))
     while high - low > 1:
-        share = (power - reached) / (found.power - reached)  # power grows almost linearly with the pairs
+        share = (power - reached) / (result.power - reached)  # power grows almost linearly with the pairs
         middle = min(max(round(low + share * (high - low)), low + 1), high - 1)
         tried = design_power(rule, middle, p_first, p_second, alpha)
         if tried.power >= power:
-            high, found = middle, tried
+            high, result = middle, tried
         else:
             low, reached = middle, tried.power
-    return found
+    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +132,8 @@ def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> Des
     import numpy as np
 
     chance = np.random.default_rng(_SEED)
-    one = chance.random((_RUNS, pairs)) < p_first
-    other = chance.random((_RUNS, pairs)) < p_second
+    first = chance.random((_RUNS, pairs)) < p_first
+    second = chance.random((_RUNS, pairs)) < p_second
     before = np.arange(pairs)
 
     def gains(worse: NDArray[np.bool_], better: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -142,10 +144,10 @@ def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> Des
         won += np.log(np.where(better, q / m, (1 - q) / (1 - m)))
         return np.asarray(np.cumsum(np.where(p < q, won, 0.0), axis=1))
 
-    reached = np.maximum(gains(other, one), gains(one, other)) >= math.log(2 / alpha)
+    reached = np.maximum(gains(second, first), gains(first, second)) >= math.log(2 / alpha)
     ended = reached.any(axis=1)
-    taken = np.where(ended, reached.argmax(axis=1) + 1, pairs)
-    return DesignPower(ANYTIME, pairs, float(ended.mean()), float(taken.mean()), int(np.median(taken)))
+    needed = np.where(ended, reached.argmax(axis=1) + 1, pairs)
+    return DesignPower(ANYTIME, pairs, float(ended.mean()), float(needed.mean()), int(np.median(needed)))
 
 
 def _check(rule: str, alpha: float, *rates: float) -> None:

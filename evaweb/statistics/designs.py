@@ -115,13 +115,17 @@ class Findings:
     @property
     def at(self) -> int | None:
         """Number of blocks after which the last comparison ended; None while any continues."""
-        ends = [one.ended_at_pair for one in self.each if one.ended_at_pair is not None]
+        ends = [conclusion.ended_at_pair for conclusion in self.each if conclusion.ended_at_pair is not None]
         return max(ends) if len(ends) == len(self.each) else None
 
     @property
     def ended(self) -> str:
         """Value of `Conclusion.ended` of the comparison that ended last; "" while any continues."""
-        return "" if self.at is None else next(one.ended for one in self.each if one.ended_at_pair == self.at)
+        return (
+            ""
+            if self.at is None
+            else next(conclusion.ended for conclusion in self.each if conclusion.ended_at_pair == self.at)
+        )
 
 
 def design(
@@ -155,7 +159,7 @@ def design(
         paired=counts is None,
     )
     exact = rule in SHAPES or (rule == FIXED and margin is not None)
-    found = Design(
+    unbounded = Design(
         rule,
         blocks,
         alpha,
@@ -167,7 +171,7 @@ def design(
         tuple(counts) if counts is not None else None,
         holm,
     )
-    return replace(found, boundary=_bounded(found, looks)) if exact else found
+    return replace(unbounded, boundary=_bounded(unbounded, looks)) if exact else unbounded
 
 
 def check_design(
@@ -212,26 +216,32 @@ def check_design(
     if not paired and (outcome == SCORE or rule == ANYTIME or len(comparisons) != 1):
         raise StatisticsError(
             "two arms in random order; allowed with: success, one comparison, and the designs "
-            f"{', '.join(one for one in RULES if one != ANYTIME)}"
+            f"{', '.join(name for name in RULES if name != ANYTIME)}"
         )
     if exact and paired and blocks > MOST:
         raise StatisticsError(f"{blocks} pairs of a design with an exact boundary; allowed: 1 to {MOST}")
 
 
-def _bounded(found: Design, looks: Sequence[int]) -> Boundary:
-    at = [found.blocks] if found.rule == FIXED else list(looks) or None
+def _bounded(unbounded: Design, schedule: Sequence[int]) -> Boundary:
+    at = [unbounded.blocks] if unbounded.rule == FIXED else list(schedule) or None
     shape = (
-        found.rule if found.rule in SHAPES else "late"
+        unbounded.rule if unbounded.rule in SHAPES else "late"
     )  # with a single look the shape of spending has no effect
-    if found.counts is None:
-        made = pair_counts(found.blocks, at)
+    if unbounded.counts is None:
+        counts = pair_counts(unbounded.blocks, at)
     else:
-        chosen = range(found.blocks) if at is None else [one - 1 for one in sorted({*at, found.blocks})]
+        chosen = (
+            range(unbounded.blocks)
+            if at is None
+            else [number - 1 for number in sorted({*at, unbounded.blocks})]
+        )
         # With a margin, a boundary tests its second arm: the comparison's first.
-        sides = (0, 1) if found.margin is None else (1, 0)
-        counted = ((found.counts[one][sides[0]], found.counts[one][sides[1]]) for one in chosen)
-        made = [count for count in counted if min(count) > 0]
-    return boundary(made, alpha=found.share, shape=shape, margin=found.margin)
+        sides = (0, 1) if unbounded.margin is None else (1, 0)
+        counted = (
+            (unbounded.counts[number][sides[0]], unbounded.counts[number][sides[1]]) for number in chosen
+        )
+        counts = [count for count in counted if min(count) > 0]
+    return boundary(counts, alpha=unbounded.share, shape=shape, margin=unbounded.margin)
 
 
 def findings(found: Design, blocks: Sequence[Block]) -> Findings:
@@ -243,34 +253,41 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
     it. An arm that was found worse leaves its other comparisons, except a control that is in all of them; with a
     margin no arm is found worse.
     """
-    given = blocks[: found.blocks]
+    trials = blocks[: found.blocks]
     if not found.drops:
-        each = [evaluate_design(found, given, pair) for pair in found.comparisons]
-        return Findings(tuple(_stepped(found, given, each) if found.holm else each), {})
+        conclusions = [evaluate_design(found, trials, pair) for pair in found.comparisons]
+        return Findings(tuple(_stepped(found, trials, conclusions) if found.holm else conclusions), {})
     decided: dict[int, Conclusion] = {}
     dropped: dict[int, int] = {}
     arms = sorted({arm for pair in found.comparisons for arm in pair})
     spared = set(arms) if found.margin is not None else set(arms).intersection(*found.comparisons)
     while len(decided) < len(found.comparisons):
-        made = _whole(given, arms, dropped)
+        complete = _whole(trials, arms, dropped)
         open_ = {
-            n: evaluate_design(found, made, pair)
+            n: evaluate_design(found, complete, pair)
             for n, pair in enumerate(found.comparisons)
             if n not in decided
         }
         first = min(
-            (one.ended_at_pair for one in open_.values() if one.ended_at_pair and one.winner), default=None
+            (
+                conclusion.ended_at_pair
+                for conclusion in open_.values()
+                if conclusion.ended_at_pair and conclusion.winner
+            ),
+            default=None,
         )
         if first is None:
             decided |= open_
             break
         crossed = {
-            n: replace(one, blocks=first)
-            for n, one in open_.items()
-            if one.ended_at_pair == first and one.winner
+            n: replace(conclusion, blocks=first)
+            for n, conclusion in open_.items()
+            if conclusion.ended_at_pair == first and conclusion.winner
         }
         decided |= crossed
-        worse = {found.comparisons[n][one.winner == "first"] for n, one in crossed.items()} - spared
+        worse = {
+            found.comparisons[n][conclusion.winner == "first"] for n, conclusion in crossed.items()
+        } - spared
         for n in open_.keys() - crossed.keys():
             if worse & {*found.comparisons[n]}:
                 decided[n] = Conclusion(first, first, None, None, found.blocks, dropped=first < found.blocks)
@@ -282,19 +299,21 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
 def unbeaten(found: Design, said: Findings) -> list[int]:
     """Return the arms that no comparison found worse, for a design that has ended."""
     pairs = zip(found.comparisons, said.each, strict=True)
-    beaten = {pair[one.winner == "first"] for pair, one in pairs if one.winner}
+    beaten = {pair[conclusion.winner == "first"] for pair, conclusion in pairs if conclusion.winner}
     return [arm for arm in sorted({arm for pair in found.comparisons for arm in pair}) if arm not in beaten]
 
 
-def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> list[Conclusion]:
+def _stepped(frozen: Design, blocks: Sequence[Block], conclusions: list[Conclusion]) -> list[Conclusion]:
     """Return the conclusions by Holm's procedure; unchanged until every comparison has its test."""
-    tests = {number: one.p for number, one in enumerate(each) if one.p is not None}
-    if len(tests) < len(each):
-        return each
-    decided = list(each)
-    for done, number in enumerate(sorted(tests, key=lambda number: tests[number])):
-        left = replace(found, alpha=found.alpha * len(each) / (len(each) - done))
-        decided[number] = evaluate_design(left, blocks, found.comparisons[number])
+    tests = {
+        number: conclusion.p for number, conclusion in enumerate(conclusions) if conclusion.p is not None
+    }
+    if len(tests) < len(conclusions):
+        return conclusions
+    decided = list(conclusions)
+    for tested, number in enumerate(sorted(tests, key=lambda number: tests[number])):
+        left = replace(frozen, alpha=frozen.alpha * len(conclusions) / (len(conclusions) - tested))
+        decided[number] = evaluate_design(left, blocks, frozen.comparisons[number])
         if decided[number].winner is None:
             break
     return decided
@@ -302,13 +321,13 @@ def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> 
 
 def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]) -> list[Block]:
     """Return the blocks before the first that lacks an arm which was not dropped before it."""
-    made = []
+    complete = []
     for number, block in enumerate(blocks):
-        there = {arm for arm, _ in block}
-        if any(arm not in there and dropped.get(arm, number + 1) > number for arm in arms):
+        present = {arm for arm, _ in block}
+        if any(arm not in present and dropped.get(arm, number + 1) > number for arm in arms):
             break
-        made.append(block)
-    return made
+        complete.append(block)
+    return complete
 
 
 def evaluate_design(found: Design, blocks: Sequence[Block], pair: tuple[int, int] = (0, 1)) -> Conclusion:
@@ -316,18 +335,18 @@ def evaluate_design(found: Design, blocks: Sequence[Block], pair: tuple[int, int
 
     Blocks beyond those of the design are ignored.
     """
-    given = list(_complete_blocks(found, blocks[: found.blocks], pair))
-    full = len(given) if len(given) == found.blocks else None
+    sides = list(_complete_blocks(found, blocks[: found.blocks], pair))
+    full = len(sides) if len(sides) == found.blocks else None
     if found.boundary is not None:
-        at, winner = _first_crossing(found.boundary, given)
-        return Conclusion(len(given), at or full, winner, None, found.blocks)
+        at, winner = _first_crossing(found.boundary, sides)
+        return Conclusion(len(sides), at or full, winner, None, found.blocks)
     if found.rule == ANYTIME:
         of = score_evidence if found.outcome == SCORE else _of_successes
-        evidence = of([(first[0], second[0]) for first, second in given], found.share)
-        return Conclusion(len(given), evidence.stop or full, evidence.winner, None, found.blocks)
+        evidence = of([(first[0], second[0]) for first, second in sides], found.share)
+        return Conclusion(len(sides), evidence.stop or full, evidence.winner, None, found.blocks)
     if full is None:
-        return Conclusion(len(given), None, None, None, found.blocks)
-    p, lead = _scored(given) if found.outcome == SCORE else _succeeded(given)
+        return Conclusion(len(sides), None, None, None, found.blocks)
+    p, lead = _scored(sides) if found.outcome == SCORE else _succeeded(sides)
     winner = _ahead(lead, 0) if p <= found.share * (1 + _TIE) else None
     return Conclusion(full, full, winner, p, found.blocks)
 
@@ -341,9 +360,9 @@ def estimated(
     """
     if found.boundary is None or found.margin is not None or one.ended_at_pair is None or one.dropped:
         return None
-    given = list(_complete_blocks(found, blocks[: one.ended_at_pair], pair))
-    (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
-    if (n, m) not in [(look.first, look.second) for look in found.boundary.looks]:
+    sides = list(_complete_blocks(found, blocks[: one.ended_at_pair], pair))
+    (first, n), (second, m) = (_sum(sides, side) for side in (0, 1))
+    if (n, m) not in [(table.first, table.second) for table in found.boundary.looks]:
         return None
     return stagewise(found.boundary, first, n, second, m)
 
@@ -351,55 +370,55 @@ def estimated(
 Sides = tuple[list[float], list[float]]  # outcomes of the first and of the second arm in one block
 
 
-def _complete_blocks(found: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
+def _complete_blocks(frozen: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
     """Yield the outcomes by side of the blocks before the first incomplete one."""
     before = (0, 0)
     for number, block in enumerate(blocks):
         sides = ([value for arm, value in block if arm == pair[0]], [v for arm, v in block if arm == pair[1]])
-        after = (number + 1, number + 1) if found.counts is None else found.counts[number]
+        after = (number + 1, number + 1) if frozen.counts is None else frozen.counts[number]
         if (len(sides[0]), len(sides[1])) != (after[0] - before[0], after[1] - before[1]):
             return
         before = after
         yield sides
 
 
-def _succeeded(given: Sequence[Sides]) -> tuple[float, float]:
+def _succeeded(blocks: Sequence[Sides]) -> tuple[float, float]:
     """Return p of the single test of a fixed number of blocks, and the first arm's rate minus the second's."""
-    (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
+    (first, n), (second, m) = (_sum(blocks, side) for side in (0, 1))
     if not n or not m:
         return 1.0, 0.0
     return barnard(first, n, second, m).p, first / n - second / m
 
 
-def _sum(given: Sequence[Sides], side: int) -> tuple[int, int]:
+def _sum(blocks: Sequence[Sides], side: int) -> tuple[int, int]:
     """Return successes and trials of one side."""
-    return sum(bool(v) for sides in given for v in sides[side]), sum(len(sides[side]) for sides in given)
+    return sum(bool(v) for sides in blocks for v in sides[side]), sum(len(sides[side]) for sides in blocks)
 
 
-def _scored(given: Sequence[Sides]) -> tuple[float, float]:
-    flips = sign_flip_test([first[0] - second[0] for first, second in given])
+def _scored(blocks: Sequence[Sides]) -> tuple[float, float]:
+    flips = sign_flip_test([first[0] - second[0] for first, second in blocks])
     return flips.p, flips.value
 
 
 def _of_successes(values: Sequence[Values], alpha: float):  # type: ignore[no-untyped-def]
-    return success_evidence([(bool(one), bool(other)) for one, other in values], alpha)
+    return success_evidence([(bool(first), bool(second)) for first, second in values], alpha)
 
 
-def _first_crossing(found: Boundary, given: Sequence[Sides]) -> tuple[int | None, str | None]:
+def _first_crossing(limits: Boundary, blocks: Sequence[Sides]) -> tuple[int | None, str | None]:
     """Return the number of blocks after which the boundary was crossed and the winning side, or (None, None)."""
     # With a margin, a boundary tests its second arm: the comparison's first.
-    sides = (0, 1) if found.margin is None else (1, 0)
+    sides = (0, 1) if limits.margin is None else (1, 0)
     totals = [(0, 0), (0, 0)]  # (successes, trials) by side
-    looks = {(look.first, look.second): number for number, look in enumerate(found.looks)}
-    for at, block in enumerate(given, start=1):
+    numbers = {(table.first, table.second): number for number, table in enumerate(limits.looks)}
+    for at, block in enumerate(blocks, start=1):
         totals = [
             (wins + sum(bool(v) for v in block[side]), trials + len(block[side]))
             for side, (wins, trials) in zip(sides, totals, strict=True)
         ]
-        number = looks.get((totals[0][1], totals[1][1]))
-        winner = None if number is None else found.winner(number, totals[0][0], totals[1][0])
+        number = numbers.get((totals[0][1], totals[1][1]))
+        winner = None if number is None else limits.winner(number, totals[0][0], totals[1][0])
         if winner:
-            return at, winner if found.margin is None else "first"
+            return at, winner if limits.margin is None else "first"
     return None, None
 
 
@@ -419,35 +438,35 @@ def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tupl
 
 def of_so_many(found: Design, blocks: int) -> Design:
     """Return the design of one comparison for `blocks` pairs instead; looks beyond them are omitted."""
-    looks = look_schedule(found) if found.rule in SHAPES else []
-    made = design(
+    schedule = look_schedule(found) if found.rule in SHAPES else []
+    shortened = design(
         rule=found.rule,
         blocks=blocks,
         alpha=found.alpha,
         margin=found.margin,
         outcome=found.outcome,
-        looks=[] if len(looks) == found.blocks else [look for look in looks if look <= blocks],
+        looks=[] if len(schedule) == found.blocks else [number for number in schedule if number <= blocks],
     )
-    return replace(made, comparisons=found.comparisons)
+    return replace(shortened, comparisons=found.comparisons)
 
 
 def in_blocks(values: Sequence[Values]) -> list[Block]:
     """Return paired blocks of two arms from their outcomes."""
-    return [((0, one), (1, other)) for one, other in values]
+    return [((0, first), (1, second)) for first, second in values]
 
 
 def look_schedule(found: Design) -> list[int]:
     """Return the numbers of blocks at which the boundary has looks; [] without a boundary."""
-    looks = found.boundary.looks if found.boundary else ()
-    return [(look.first + look.second) // 2 for look in looks]  # a block of a comparison has two trials
+    tables = found.boundary.looks if found.boundary else ()
+    return [(table.first + table.second) // 2 for table in tables]  # a block of a comparison has two trials
 
 
 def boundary_table(found: Boundary) -> list[list[int]]:
     """Return the boundary as JSON: per look the trials of each arm, then the least extreme stopping table, if any."""
-    return [[look.first, look.second, *(look.least or ())] for look in found.looks]
+    return [[table.first, table.second, *(table.least or ())] for table in found.looks]
 
 
 def boundary_from_table(rows: Sequence[Sequence[int]], alpha: float, margin: float | None) -> Boundary:
     """Return the boundary from rows of `boundary_table`."""
-    looks = (StoppingTable(n, m, (least[0], least[1]) if least else None) for n, m, *least in rows)
-    return Boundary(tuple(looks), alpha, margin)
+    tables = (StoppingTable(n, m, (least[0], least[1]) if least else None) for n, m, *least in rows)
+    return Boundary(tuple(tables), alpha, margin)

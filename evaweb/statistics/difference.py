@@ -91,9 +91,9 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> ExactTest:
         middle, width = angles[peak], angles[1] - angles[0]
         for _ in range(_ZOOMS):
             near = np.clip(np.linspace(middle - width, middle + width, 21), 1e-9, math.pi / 2 - 1e-9)
-            found = _tail(extreme, n2, near)
-            middle, width = near[found.argmax()], width / 10
-            highest = max(highest, float(found.max()))
+            probabilities = _tail(extreme, n2, near)
+            middle, width = near[probabilities.argmax()], width / 10
+            highest = max(highest, float(probabilities.max()))
     return ExactTest(float(z[x1, x2]), min(1.0, highest))
 
 
@@ -115,12 +115,12 @@ def _tail(extreme: NDArray[np.int64], n2: int, angles: NDArray[np.float64]) -> N
     import numpy as np
     from scipy.special import gammaln
 
-    share, rest = np.log(np.sin(angles))[:, None], np.log(np.cos(angles))[:, None]
+    log_success, log_failure = np.log(np.sin(angles))[:, None], np.log(np.cos(angles))[:, None]
 
     def mass(n: int) -> NDArray[np.float64]:
         x = np.arange(n + 1)
-        ways = gammaln(n + 1) - gammaln(x + 1) - gammaln(n - x + 1)
-        return np.asarray(np.exp(ways + 2 * x * share + 2 * (n - x) * rest))
+        log_ways = gammaln(n + 1) - gammaln(x + 1) - gammaln(n - x + 1)
+        return np.asarray(np.exp(log_ways + 2 * x * log_success + 2 * (n - x) * log_failure))
 
     first, second = mass(extreme.shape[1] - 1), mass(n2)
     nothing = np.zeros((len(angles), 1))

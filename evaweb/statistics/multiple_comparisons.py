@@ -35,12 +35,12 @@ def letters(names: Sequence[str], separated: Collection[frozenset[str]]) -> dict
         if len(pair) != 2 or not pair <= set(names):
             raise StatisticsError(f"separated pair {sorted(pair)}; allowed: two of {list(names)}")
     columns: list[frozenset[str]] = [frozenset(names)] if names else []
-    for one, other in combinations(names, 2):
-        if frozenset((one, other)) not in separated:
+    for first, second in combinations(names, 2):
+        if frozenset((first, second)) not in separated:
             continue
         split: list[frozenset[str]] = []
         for column in columns:
-            split += [column - {one}, column - {other}] if {one, other} <= column else [column]
+            split += [column - {first}, column - {second}] if {first, second} <= column else [column]
         columns = _absorbed(split)
     place = {name: i for i, name in enumerate(names)}
     columns.sort(key=lambda column: sorted(place[name] for name in column))
@@ -49,11 +49,11 @@ def letters(names: Sequence[str], separated: Collection[frozenset[str]]) -> dict
 
 def _absorbed(columns: list[frozenset[str]]) -> list[frozenset[str]]:
     """Return the columns without those that are contained in another."""
-    kept: list[frozenset[str]] = []
+    retained: list[frozenset[str]] = []
     for column in sorted(set(columns), key=lambda column: (-len(column), sorted(column))):
-        if not any(column <= other for other in kept):
-            kept.append(column)
-    return kept
+        if not any(column <= larger for larger in retained):
+            retained.append(column)
+    return retained
 
 
 def _letter(i: int) -> str:

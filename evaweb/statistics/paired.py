@@ -30,8 +30,8 @@ class McNemar:
 
 def mcnemar(pairs: Sequence[tuple[bool, bool]]) -> McNemar:
     """Return the exact test of pairs (first succeeded, second succeeded); without discordant pairs p is 1."""
-    first = sum(1 for one, other in pairs if one and not other)
-    second = sum(1 for one, other in pairs if other and not one)
+    first = sum(1 for of_first, of_second in pairs if of_first and not of_second)
+    second = sum(1 for of_first, of_second in pairs if of_second and not of_first)
     return McNemar(first, second, len(pairs), _binomial(first, second))
 
 
@@ -68,5 +68,5 @@ def over_conditions(
         if empty:
             raise StatisticsError(f"the {name} arm has no trial at {empty[0]!r}")
     differences = [fmean(first[key]) - fmean(second[key]) for key in shared]
-    found = bounded_mean({"all": differences}, seed=seed, bounds=(-1.0, 1.0), level=level, draws=draws)
-    return Difference(found.value, found.interval)
+    mean = bounded_mean({"all": differences}, seed=seed, bounds=(-1.0, 1.0), level=level, draws=draws)
+    return Difference(mean.value, mean.interval)

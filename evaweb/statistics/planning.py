@@ -94,8 +94,8 @@ def _barnard_tables(n: int) -> NDArray[np.float64]:
     worst = np.zeros(len(levels))
     # Exchanging success and failure leaves every table as extreme: rates above 0.5 add nothing.
     for mass in _masses(n, np.linspace(0, 1, _RATES + 2)[1 : _RATES // 2 + 1]):
-        each = np.bincount(level.ravel(), weights=np.outer(mass, mass).ravel(), minlength=len(levels))
-        np.maximum(worst, np.cumsum(each), out=worst)
+        level_mass = np.bincount(level.ravel(), weights=np.outer(mass, mass).ravel(), minlength=len(levels))
+        np.maximum(worst, np.cumsum(level_mass), out=worst)
     return np.minimum(worst, 1.0)[level].reshape(n + 1, n + 1)
 
 
@@ -105,8 +105,8 @@ def _masses(n: int, rates: NDArray[np.float64]) -> NDArray[np.float64]:
     from scipy.special import gammaln, xlog1py, xlogy
 
     x = np.arange(n + 1)
-    ways = gammaln(n + 1) - gammaln(x + 1) - gammaln(n - x + 1)
-    return np.asarray(np.exp(ways + xlogy(x, rates[:, None]) + xlog1py(n - x, -rates[:, None])))
+    log_ways = gammaln(n + 1) - gammaln(x + 1) - gammaln(n - x + 1)
+    return np.asarray(np.exp(log_ways + xlogy(x, rates[:, None]) + xlog1py(n - x, -rates[:, None])))
 
 
 def _check(p1: float, p2: float, alpha: float) -> None:

@@ -113,11 +113,11 @@ def preferences(
     errors = np.sqrt(np.diag(spread))
     z = z_of(level)
     contrasts = {}
-    for (i, one), (j, other) in combinations(enumerate(design.names), 2):
+    for (i, first), (j, second) in combinations(enumerate(design.names), 2):
         difference = float(centred[i] - centred[j])
         error = math.sqrt(spread[i, i] + spread[j, j] - 2 * spread[i, j])
         ends = (difference - z * error, difference + z * error)
-        contrasts[one, other] = Contrast(
+        contrasts[first, second] = Contrast(
             difference,
             error,
             Interval(*ends, level),
@@ -142,34 +142,38 @@ class _Design:
     def __init__(self, comparisons: Sequence[Comparison], order_effect: bool) -> None:
         import numpy as np
 
-        for given in comparisons:
-            if given.first == given.second:
-                raise StatisticsError(f"{given.first!r} compared with itself")
-            if given.outcome not in ("first", "second", "tie"):
-                raise StatisticsError(f"outcome {given.outcome!r}; allowed: first, second, tie")
-        self.names = sorted({name for given in comparisons for name in (given.first, given.second)})
+        for comparison in comparisons:
+            if comparison.first == comparison.second:
+                raise StatisticsError(f"{comparison.first!r} compared with itself")
+            if comparison.outcome not in ("first", "second", "tie"):
+                raise StatisticsError(f"outcome {comparison.outcome!r}; allowed: first, second, tie")
+        self.names = sorted(
+            {name for comparison in comparisons for name in (comparison.first, comparison.second)}
+        )
         if len(self.names) < 2:
             raise StatisticsError("no comparison of two policies")
         self.wins = Counter(
-            (given.first, given.second) if given.outcome == "first" else (given.second, given.first)
-            for given in comparisons
-            if given.outcome != "tie"
+            (comparison.first, comparison.second)
+            if comparison.outcome == "first"
+            else (comparison.second, comparison.first)
+            for comparison in comparisons
+            if comparison.outcome != "tie"
         )
-        self.ties = any(given.outcome == "tie" for given in comparisons)
+        self.ties = any(comparison.outcome == "tie" for comparison in comparisons)
         cells: defaultdict[tuple[str, str, Outcome], float] = defaultdict(float)
-        for given in comparisons:
-            cells[given.first, given.second, given.outcome] += given.weight
-        shown = sorted({(first, second) for first, second, _ in cells})
+        for comparison in comparisons:
+            cells[comparison.first, comparison.second, comparison.outcome] += comparison.weight
+        compared = sorted({(first, second) for first, second, _ in cells})
         outcomes: tuple[Outcome, ...] = ("first", "second", "tie") if self.ties else ("first", "second")
         k = len(self.names)
         self.size = k - 1 + self.ties + order_effect
-        self.vectors = np.zeros((len(shown), len(outcomes), self.size))
-        self.counts = np.array([[cells[*pair, o] for o in outcomes] for pair in shown])
+        self.vectors = np.zeros((len(compared), len(outcomes), self.size))
+        self.counts = np.array([[cells[*pair, o] for o in outcomes] for pair in compared])
         self.offsets = np.array([0.0, 0.0, math.log(2)][: len(outcomes)])
         place = {
             name: i - 1 for i, name in enumerate(self.names)
         }  # the first policy is the reference: index -1
-        for row, (first, second) in zip(self.vectors, shown, strict=True):
+        for row, (first, second) in zip(self.vectors, compared, strict=True):
             for name, outcome in ((first, 0), (second, 1)):
                 if place[name] >= 0:
                     row[outcome, place[name]] += 1
@@ -186,11 +190,11 @@ class _Design:
         from scipy.optimize import linprog
 
         steps = [
-            observed - other
+            observed - vector
             for vectors, counts in zip(self.vectors, self.counts, strict=True)
             for o, observed in enumerate(vectors)
             if counts[o] > 0
-            for a, other in enumerate(vectors)
+            for a, vector in enumerate(vectors)
             if a != o
         ]
         d = np.array(steps)
@@ -200,10 +204,10 @@ class _Design:
                 "no common ranking",
                 self.components(),
             )
-        found = linprog(-d.sum(axis=0), A_ub=-d, b_ub=np.zeros(len(d)), bounds=[(-1, 1)] * self.size)
-        if not found.success:
-            raise StatisticsError(f"whether a ranking exists could not be decided: {found.message}")
-        if -found.fun > 1e-9 * len(d):
+        solution = linprog(-d.sum(axis=0), A_ub=-d, b_ub=np.zeros(len(d)), bounds=[(-1, 1)] * self.size)
+        if not solution.success:
+            raise StatisticsError(f"whether a ranking exists could not be decided: {solution.message}")
+        if -solution.fun > 1e-9 * len(d):
             raise NotIdentifiedError(
                 "some policies, or those shown first, never lost to the others: how much better they are has no bound",
                 self.components(),
@@ -214,7 +218,7 @@ class _Design:
 
         Sets that no policy outside has beaten come first.
         """
-        reach = {name: {name} | {other for (w, other) in self.wins if w == name} for name in self.names}
+        reach = {name: {name} | {loser for (w, loser) in self.wins if w == name} for name in self.names}
         for via in self.names:
             for name in self.names:
                 if via in reach[name]:

@@ -24,8 +24,8 @@ def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
     """
     _require_pairs(pairs)
     n = len(pairs)
-    observed = sum(one == other for one, other in pairs) / n
-    first, second = Counter(one for one, _ in pairs), Counter(other for _, other in pairs)
+    observed = sum(left == right for left, right in pairs) / n
+    first, second = Counter(left for left, _ in pairs), Counter(right for _, right in pairs)
     chance = sum(first[name] * second[name] for name in first) / (n * n)
     _varied({*first, *second})
     return _chance_corrected(observed, chance)
@@ -40,7 +40,7 @@ def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) ->
             f"{len(used)} categories were used, {categories} are declared; at least 2 are needed"
         )
     n = len(pairs)
-    observed = sum(one == other for one, other in pairs) / n
+    observed = sum(first == second for first, second in pairs) / n
     shares = [count / (2 * n) for count in used.values()]
     chance = sum(share * (1 - share) for share in shares) / (categories - 1)
     return _chance_corrected(observed, chance)
@@ -57,22 +57,22 @@ def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric =
     if not rated:
         raise StatisticsError("no trial was rated by two people")
 
-    def apart(one: float, other: float) -> float:
-        return float(one != other) if metric == "nominal" else (one - other) ** 2
+    def apart(left: float, right: float) -> float:
+        return float(left != right) if metric == "nominal" else (left - right) ** 2
 
     coincidences: Counter[tuple[float, float]] = Counter()
     for unit in rated:
         for pair in permutations(unit, 2):
             coincidences[pair] += 1 / (len(unit) - 1)  # type: ignore[assignment]
     totals: Counter[float] = Counter()
-    for (one, _), weight in coincidences.items():
-        totals[one] += weight
+    for (left, _), weight in coincidences.items():
+        totals[left] += weight
     _varied(totals)
     n = sum(totals.values())
     observed = sum(weight * apart(*pair) for pair, weight in coincidences.items()) / n
-    expected = sum(totals[one] * totals[other] * apart(one, other) for one in totals for other in totals) / (
-        n * (n - 1)
-    )
+    expected = sum(
+        totals[left] * totals[right] * apart(left, right) for left in totals for right in totals
+    ) / (n * (n - 1))
     return 1.0 if observed == 0 else 1 - observed / expected
 
 

@@ -94,9 +94,9 @@ def score_course(rule: str, pairs: int, scores: Scores, alpha: float) -> DesignP
         power = float((_flipped(_differences(scores)[:, :pairs], scores.points) <= alpha * (1 + _TIE)).mean())
         return DesignPower(rule, pairs, power, float(pairs), pairs)
     stops = _stops(scores, alpha)
-    taken = np.minimum(stops, pairs)
+    needed = np.minimum(stops, pairs)
     return DesignPower(
-        rule, pairs, float((stops <= pairs).mean()), float(taken.mean()), int(np.median(taken))
+        rule, pairs, float((stops <= pairs).mean()), float(needed.mean()), int(np.median(needed))
     )
 
 
@@ -121,12 +121,12 @@ def _differences(scores: Scores) -> NDArray[Any]:
     import numpy as np
 
     chance = np.random.default_rng(_SEED)
-    found = np.zeros((RUNS, MOST), np.int8)
+    differences = np.zeros((RUNS, MOST), np.int8)
     for mean, sign in ((scores.first, 1), (scores.second, -1)):
         drawn = chance.random((RUNS, MOST), np.float32)
         for below in accumulate(scores.chances(mean)[:-1]):
-            found += sign * (drawn >= below).astype(np.int8)
-    return found
+            differences += sign * (drawn >= below).astype(np.int8)
+    return differences
 
 
 def _flipped(differences: NDArray[Any], points: int) -> NDArray[Any]:
@@ -141,8 +141,8 @@ def _flipped(differences: NDArray[Any], points: int) -> NDArray[Any]:
     spectrum = np.ones((len(sizes), len(turns)), complex)
     for size in range(1, points + 1):
         counts = (sizes == size).sum(axis=1)
-        one = (1 + turns**-size) / 2  # of one difference, which is negative in half of all cases
-        spectrum *= (one ** np.arange(int(counts.max()) + 1)[:, None])[counts]
+        factor = (1 + turns**-size) / 2  # of one difference, which is negative in half of all cases
+        spectrum *= (factor ** np.arange(int(counts.max()) + 1)[:, None])[counts]
     below = np.cumsum(np.fft.irfft(spectrum, length, axis=1), axis=1)
     least = ((total - observed) // 2)[:, None]
     p = 2 * np.take_along_axis(below, least, axis=1)[:, 0]

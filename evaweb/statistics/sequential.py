@@ -56,13 +56,13 @@ def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -
     first, second = [], []
     log_first = log_second = 0.0
     n = wins1 = wins2 = 0
-    for one, other in pairs:
+    for first_success, second_success in pairs:
         # The favoured arm has the prior Beta(2, 1), the other Beta(1, 2): so there is a bet before the first trial.
-        log_first += _factor((1 + wins2) / (3 + n), (2 + wins1) / (3 + n), other, one)
-        log_second += _factor((1 + wins1) / (3 + n), (2 + wins2) / (3 + n), one, other)
+        log_first += _factor((1 + wins2) / (3 + n), (2 + wins1) / (3 + n), second_success, first_success)
+        log_second += _factor((1 + wins1) / (3 + n), (2 + wins2) / (3 + n), first_success, second_success)
         first.append(log_first)
         second.append(log_second)
-        n, wins1, wins2 = n + 1, wins1 + bool(one), wins2 + bool(other)
+        n, wins1, wins2 = n + 1, wins1 + bool(first_success), wins2 + bool(second_success)
     return _evidence(first, second, alpha)
 
 
@@ -81,11 +81,11 @@ def _log(rate: float, success: bool) -> float:
 def score_evidence(pairs: Iterable[tuple[float, float]], alpha: float = ALPHA) -> Evidence:
     """Return the evidence of pairs (score of the first, score of the second), each 0 to 1, in the order of running."""
     check_alpha(alpha)
-    given = list(pairs)
-    for one, other in given:
-        check_share("score", one)
-        check_share("score", other)
-    return _evidence(_log_wealth([a - b for a, b in given]), _log_wealth([b - a for a, b in given]), alpha)
+    scores = list(pairs)
+    for first_score, second_score in scores:
+        check_share("score", first_score)
+        check_share("score", second_score)
+    return _evidence(_log_wealth([a - b for a, b in scores]), _log_wealth([b - a for a, b in scores]), alpha)
 
 
 def _log_wealth(differences: Sequence[float]) -> list[float]:
@@ -103,16 +103,16 @@ def _log_wealth(differences: Sequence[float]) -> list[float]:
 
 def _evidence(first: list[float], second: list[float], alpha: float) -> Evidence:
     p_first, p_second = _anytime(first), _anytime(second)
-    for pair, (one, other) in enumerate(zip(p_first, p_second, strict=True), start=1):
-        if min(one, other) <= alpha / 2:
-            winner = "first" if one <= other else "second"
+    for pair, (value_first, value_second) in enumerate(zip(p_first, p_second, strict=True), start=1):
+        if min(value_first, value_second) <= alpha / 2:
+            winner = "first" if value_first <= value_second else "second"
             return Evidence(tuple(first), tuple(second), tuple(p_first), tuple(p_second), alpha, pair, winner)
     return Evidence(tuple(first), tuple(second), tuple(p_first), tuple(p_second), alpha, None, None)
 
 
 def _anytime(path: Sequence[float]) -> list[float]:
-    lowest, found = 1.0, []
+    lowest, p_values = 1.0, []
     for log_e in path:
         lowest = min(lowest, math.exp(-log_e) if log_e > 0 else 1.0)
-        found.append(lowest)
-    return found
+        p_values.append(lowest)
+    return p_values

@@ -36,11 +36,11 @@ def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float
     constant.
     """
     _check(simulated, real)
-    ours, theirs = _ranks(simulated), _ranks(real)
-    if len(ours) < 2:
+    simulated_ranks, real_ranks = _ranks(simulated), _ranks(real)
+    if len(simulated_ranks) < 2:
         return None
-    spread = _covariance(ours, ours) * _covariance(theirs, theirs)
-    return _covariance(ours, theirs) / math.sqrt(spread) if spread > 0 else None
+    spread = _covariance(simulated_ranks, simulated_ranks) * _covariance(real_ranks, real_ranks)
+    return _covariance(simulated_ranks, real_ranks) / math.sqrt(spread) if spread > 0 else None
 
 
 def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
@@ -75,41 +75,41 @@ def powered_difference(first: Powered, second: Powered, level: float = LEVEL) ->
         won = math.fsum(real for real, _ in arm.paired)
         if len(arm.paired) < _FEWEST or min(won, len(arm.paired) - won) < _FEWEST_OF_EACH:
             return None
-    (one, spread), (other, spread_of_other) = _powered(first), _powered(second)
-    half = NormalDist().inv_cdf(0.5 + level / 2) * math.sqrt(spread + spread_of_other)
-    value = one - other
+    (mean_first, spread_first), (mean_second, spread_second) = _powered(first), _powered(second)
+    half = NormalDist().inv_cdf(0.5 + level / 2) * math.sqrt(spread_first + spread_second)
+    value = mean_first - mean_second
     return Difference(value, Interval(max(-1.0, value - half), min(1.0, value + half), level))
 
 
 def _powered(arm: Powered) -> tuple[float, float]:
     """Return the estimated mean and its variance."""
     real, matched = ([pair[side] for pair in arm.paired] for side in (0, 1))
-    n, beside = len(real), list(arm.beside)
-    if len(beside) < 2:
+    n, extra = len(real), list(arm.beside)
+    if len(extra) < 2:
         return math.fsum(real) / n, _covariance(real, real) / (n - 1) / n
-    whole = [*matched, *beside]
+    whole = [*matched, *extra]
     spread = _covariance(whole, whole) / (len(whole) - 1)
     weight = 0.0
     if spread > 0:
-        weight = _covariance(real, matched) / (n - 1) / (spread * (1 + n / len(beside)))
+        weight = _covariance(real, matched) / (n - 1) / (spread * (1 + n / len(extra)))
         weight = min(max(weight, 0.0), 1.0)
-    left = [one - weight * other for one, other in arm.paired]
-    mean = math.fsum(left) / n + weight * math.fsum(beside) / len(beside)
+    left = [real_value - weight * simulated_value for real_value, simulated_value in arm.paired]
+    mean = math.fsum(left) / n + weight * math.fsum(extra) / len(extra)
     variance = _covariance(left, left) / (n - 1) / n
-    return mean, variance + weight**2 * _covariance(beside, beside) / (len(beside) - 1) / len(beside)
+    return mean, variance + weight**2 * _covariance(extra, extra) / (len(extra) - 1) / len(extra)
 
 
-def _covariance(one: Sequence[float], other: Sequence[float]) -> float:
+def _covariance(first: Sequence[float], second: Sequence[float]) -> float:
     """Return the sum of the products of both deviations from their means, which is not divided by the number of
     values.
     """
-    mean, of_other = math.fsum(one) / len(one), math.fsum(other) / len(other)
-    return math.fsum((a - mean) * (b - of_other) for a, b in zip(one, other, strict=True))
+    mean_first, mean_second = math.fsum(first) / len(first), math.fsum(second) / len(second)
+    return math.fsum((a - mean_first) * (b - mean_second) for a, b in zip(first, second, strict=True))
 
 
 def _ranks(values: Sequence[float]) -> list[float]:
     return [
-        (sum(other < value for other in values) + sum(other <= value for other in values) + 1) / 2
+        (sum(compared < value for compared in values) + sum(compared <= value for compared in values) + 1) / 2
         for value in values
     ]
 

@@ -44,23 +44,23 @@ def stagewise(found: Boundary, first: int, n: int, second: int, m: int, level: f
     Raises:
         StatisticsError: If the design did not end there.
     """
-    look = next((i for i, at in enumerate(found.looks) if (at.first, at.second) == (n, m)), None)
-    if found.margin is not None or look is None:
+    number = next((i for i, at in enumerate(found.looks) if (at.first, at.second) == (n, m)), None)
+    if found.margin is not None or number is None:
         raise StatisticsError(f"no look of this design is after {n} and {m} trials")
-    if found.winner(look, first, second) is None and look < len(found.looks) - 1:
+    if found.winner(number, first, second) is None and number < len(found.looks) - 1:
         raise StatisticsError(f"the design goes on after {first}/{n} and {second}/{m}")
-    order = _ordered(found, look, first, second)
+    order = _ordered(found, number, first, second)
     tail = (1 - level) / 2
 
-    def at(wanted: float, more: Callable[[float, float], float]) -> float:
-        """Return the difference of rates at which `more` equals `wanted`, by bisection.
+    def at(target: float, more: Callable[[float, float], float]) -> float:
+        """Return the difference of rates at which `more` equals `target`, by bisection.
 
         `more` is a function of the probabilities of outcomes with a higher and with the same rank.
         """
         low, high = -1.0 + _EDGE, 1.0 - _EDGE
         for _ in range(_HALVED):
             middle = (low + high) / 2
-            if more(*order.probabilities(*_likeliest(middle, first, n, second, m))) < wanted:
+            if more(*order.probabilities(*_likeliest(middle, first, n, second, m))) < target:
                 low = middle
             else:
                 high = middle
@@ -89,20 +89,20 @@ class _Order:
         return (1 - beyond - same if self.mirrored else beyond), same
 
 
-def _ordered(found: Boundary, look: int, first: int, second: int) -> _Order:
+def _ordered(boundary: Boundary, last: int, first: int, second: int) -> _Order:
     import numpy as np
 
-    winner = found.winner(look, first, second)
+    winner = boundary.winner(last, first, second)
     mirrored = winner == "second"
     alive, before = np.ones((1, 1)), (0, 0)
     beyond: list[NDArray[np.float64]] = []
-    for number, (at, region) in enumerate(zip(found.looks, found.regions, strict=True)):
+    for number, (at, region) in enumerate(zip(boundary.looks, boundary.regions, strict=True)):
         alive = _add_trials(alive, at.first - before[0], at.second - before[1], (0.5, 0.5))
         before = (at.first, at.second)
         a, b = np.indices(alive.shape)
         lead = a * at.second - b * at.first
         stops = region & ((lead < 0) if mirrored else (lead > 0))
-        if number < look:
+        if number < last:
             beyond.append(_tables(np.where(stops, alive, 0.0)))
             alive = np.where(region, 0.0, alive)
             continue

@@ -102,12 +102,12 @@ def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None
     total = {0: 1}
     for table in telling:
         grown: dict[int, int] = {}
-        for before, ways in total.items():
+        for before, number in total.items():
             for x, more in table.ways.items():
-                grown[before + x] = grown.get(before + x, 0) + ways * more
+                grown[before + x] = grown.get(before + x, 0) + number * more
         total = grown
-    seen = total[sum(table.x1 for table in telling)]
-    return sum(ways for ways in total.values() if ways <= seen) / sum(total.values())
+    observed = total[sum(table.x1 for table in telling)]
+    return sum(number for number in total.values() if number <= observed) / sum(total.values())
 
 
 def interaction(tables: Sequence[StratumTable]) -> float | None:
@@ -118,11 +118,11 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
     telling = sorted((table for table in tables if table.is_informative), key=lambda table: len(table.ways))
     if len(telling) < 2 or math.prod(len(table.ways) for table in telling[:-1]) > _MOST:
         return None
-    seen = math.prod(table.ways[table.x1] for table in telling)
+    observed = math.prod(table.ways[table.x1] for table in telling)
     as_improbable = whole = 0
-    for ways in _fillings([table.ways for table in telling], sum(table.x1 for table in telling)):
-        whole += ways
-        as_improbable += ways if ways <= seen else 0
+    for number in _fillings([table.ways for table in telling], sum(table.x1 for table in telling)):
+        whole += number
+        as_improbable += number if number <= observed else 0
     return as_improbable / whole
 
 
@@ -131,11 +131,11 @@ def _fillings(tables: Sequence[dict[int, int]], left: int) -> Iterator[int]:
 
     Only choices whose sum is `left` are considered.
     """
-    first, *rest = tables
-    if not rest:
+    first, *further = tables
+    if not further:
         if left in first:
             yield first[left]
         return
-    for x, ways in first.items():
-        for more in _fillings(rest, left - x):
-            yield ways * more
+    for x, number in first.items():
+        for more in _fillings(further, left - x):
+            yield number * more

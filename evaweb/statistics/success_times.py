@@ -50,9 +50,9 @@ class RestrictedMean:
 
 def cumulative_incidence(times: Times, until: float, level: float = LEVEL) -> Curve:
     """Return the curve of trials with these `times` to success [s], up to `until` [s]."""
-    known = [t for t in censor_at_horizon(times, until) if t is not None]
-    n, steps = len(times), sorted(set(known))
-    counts = [sum(t <= step for t in known) for step in steps]
+    observed = [t for t in censor_at_horizon(times, until) if t is not None]
+    n, steps = len(times), sorted(set(observed))
+    counts = [sum(t <= step for t in observed) for step in steps]
     ends = [wilson(count, n, level) for count in counts]
     return Curve(
         tuple(steps),
@@ -60,7 +60,7 @@ def cumulative_incidence(times: Times, until: float, level: float = LEVEL) -> Cu
         tuple(end.low for end in ends),
         tuple(end.high for end in ends),
         n,
-        len(known),
+        len(observed),
         until,
     )
 
@@ -68,8 +68,8 @@ def cumulative_incidence(times: Times, until: float, level: float = LEVEL) -> Cu
 def restricted_mean(times: Times, until: float, *, seed: int, level: float = LEVEL) -> RestrictedMean:
     """Return the restricted mean of `times` [s] up to `until` [s]."""
     lasted = {"all": [until if t is None else t for t in censor_at_horizon(times, until)]}
-    found = bounded_mean(lasted, seed=seed, bounds=(0.0, until), level=level)
-    return RestrictedMean(found.value, found.interval, until)
+    mean = bounded_mean(lasted, seed=seed, bounds=(0.0, until), level=level)
+    return RestrictedMean(mean.value, mean.interval, until)
 
 
 def censor_at_horizon(times: Times, until: float) -> list[float | None]:

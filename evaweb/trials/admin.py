@@ -148,13 +148,13 @@ def _readable(policy: Any) -> Any:
     if not isinstance(policy, dict):
         return policy
     url, tunnel = str(policy.get("url") or ""), policy.get("tunnel")
-    shown = {**policy}
+    readable = {**policy}
     if url:
         parts = urlsplit(url)
-        shown["url"] = f"{parts.scheme}://{parts.hostname}:{parts.port}{parts.path}"
+        readable["url"] = f"{parts.scheme}://{parts.hostname}:{parts.port}{parts.path}"
     if isinstance(tunnel, dict):
-        shown["tunnel"] = {key: tunnel[key] for key in ("host", "port") if key in tunnel}
-    return shown
+        readable["tunnel"] = {key: tunnel[key] for key in ("host", "port") if key in tunnel}
+    return readable
 
 
 class ActiveActions:
@@ -230,10 +230,10 @@ class SceneAdmin(ActiveActions, LogsValues):
         changed = formset.changed_objects or formset.deleted_objects or formset.new_objects
         trials = form.instance.trials.count() if change and changed else 0
         if trials:
-            what = formset.model._meta.verbose_name_plural
+            name = formset.model._meta.verbose_name_plural
             messages.warning(
                 request,
-                f"{_trials(trials)} made before these {what} were changed keep the old ones in their scores: "
+                f"{_trials(trials)} made before these {name} were changed keep the old ones in their scores: "
                 "where trials are to be compared, make another scene instead.",
             )
 
@@ -325,8 +325,8 @@ class CheckpointForm(forms.ModelForm):
 
     def clean_policy(self) -> dict[str, Any]:
         """Return the policy's table; {} for an empty field: then everything is as in the deployment."""
-        given = self.cleaned_data["policy"]
-        return {} if given is None else given
+        policy = self.cleaned_data["policy"]
+        return {} if policy is None else policy
 
     def clean_strategy(self) -> Any:
         """Return the strategy's table; None for an empty field: then that of the plan or station applies."""
@@ -353,8 +353,8 @@ class CheckpointAdmin(ActiveActions, LogsValues):
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
         """Add the number of trials, 0 for checkpoints hidden from the user."""
         hidden = visibility_for_request(request).checkpoints
-        shown = Count("trials", filter=~Q(pk__in=hidden)) if hidden else Count("trials")
-        return super().get_queryset(request).annotate(n_trials=shown)
+        count = Count("trials", filter=~Q(pk__in=hidden)) if hidden else Count("trials")
+        return super().get_queryset(request).annotate(n_trials=count)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Checkpoint | None = None) -> tuple[str, ...]:
         """Fix the name (which manifests contain) and digest of a checkpoint that trials or plans use."""
@@ -368,12 +368,12 @@ class CheckpointAdmin(ActiveActions, LogsValues):
     def get_deleted_objects(self, objs: Iterable[Checkpoint], request: HttpRequest) -> Any:
         """Return the objects to be deleted; dependants of used checkpoints are not listed, as they may be hidden."""
         used = [checkpoint for checkpoint in objs if checkpoint_used(checkpoint)]
-        found = super().get_deleted_objects([one for one in objs if one not in used], request)
-        to_delete, counts, perms_needed, protected = found
-        kept = [
+        deleted = super().get_deleted_objects([row for row in objs if row not in used], request)
+        to_delete, counts, perms_needed, protected = deleted
+        texts = [
             f"Checkpoint {checkpoint}: trials, or a plan that was frozen, are of it" for checkpoint in used
         ]
-        return to_delete, counts, perms_needed, [*protected, *kept]
+        return to_delete, counts, perms_needed, [*protected, *texts]
 
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
         """Warn if trials or a frozen plan use the checkpoint with another policy or strategy table."""

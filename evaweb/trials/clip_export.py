@@ -37,10 +37,10 @@ def clip_archive(filters: FailureFilters, sight: Visibility, root: str) -> Itera
     with zipfile.ZipFile(written, "w", zipfile.ZIP_STORED) as packed:  # videos are compressed already
         for page in failure_trials(filters, sight):
             for trial in page[: MOST - len(rows)]:  # more may have failed since the count
-                content, told = _clip(trial)
-                rows.append(row_of(trial, sight, root) | told)
+                content, values = _clip(trial)
+                rows.append(row_of(trial, sight, root) | values)
                 if content:
-                    packed.writestr(told["file"], content)
+                    packed.writestr(values["file"], content)
                 yield written.taken()
         packed.writestr(_TABLE, "".join(iter_csv(_ARCHIVE_COLUMNS, [rows])), zipfile.ZIP_DEFLATED)
     yield written.taken()
@@ -48,23 +48,23 @@ def clip_archive(filters: FailureFilters, sight: Visibility, root: str) -> Itera
 
 def _clip(trial: Trial) -> tuple[bytes, dict[str, Any]]:
     """Return the clip as a video (b"" if there is none) and its columns of the table."""
-    told = dict.fromkeys(("file", "why_no_file"), "") | {"file_begin_s": None}
+    values = dict.fromkeys(("file", "why_no_file"), "") | {"file_begin_s": None}
     clip, episode = clip_of(trial), trial.episode
     if clip is None or episode is None:
-        return b"", told | {"why_no_file": "it has no pictures"}
+        return b"", values | {"why_no_file": "it has no pictures"}
     try:
         video = video_file(episode.uuid, episode.cameras[0])
     except StoreError as error:
-        return b"", told | {"why_no_file": str(error)}
+        return b"", values | {"why_no_file": str(error)}
     if not video.is_file():
-        return b"", told | {"why_no_file": "its video is not prepared"}
+        return b"", values | {"why_no_file": "its video is not prepared"}
     target = io.BytesIO()
     try:
         begin = cut(video, target, clip.begin, clip.end)
     except RecordingError:
-        return b"", told | {"why_no_file": "its video cannot be read"}
+        return b"", values | {"why_no_file": "its video cannot be read"}
     name = "-".join(filter(None, (f"trial-{trial.pk}", code_of(trial))))
-    return target.getvalue(), told | {"file": f"clips/{name}.mp4", "file_begin_s": round(begin, 3)}
+    return target.getvalue(), values | {"file": f"clips/{name}.mp4", "file_begin_s": round(begin, 3)}
 
 
 class _Written(io.RawIOBase):

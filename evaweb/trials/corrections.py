@@ -48,53 +48,55 @@ def trial_failure(
     """
     require_role(user, Role.OPERATOR)
     with transaction.atomic():
-        held = lock_trial(trial)
-        seen = held.verdict
-        if seen is None or held.status != TrialStatus.SCORED:
-            raise Conflict(_TRIAL_ONLY_SCORE_COUNTS_HAS(trial=held.pk, status=held.get_status_display()))
-        given = {"failure": failure, "failure_phase": failure_phase}
-        words = {
-            field: seen_words if (new := given[field]) is None else new.strip()
-            for field, seen_words in failures.score_failure(seen).items()
+        locked = lock_trial(trial)
+        verdict = locked.verdict
+        if verdict is None or locked.status != TrialStatus.SCORED:
+            raise Conflict(_TRIAL_ONLY_SCORE_COUNTS_HAS(trial=locked.pk, status=locked.get_status_display()))
+        values = {"failure": failure, "failure_phase": failure_phase}
+        texts = {
+            field: seen_words if (new := values[field]) is None else new.strip()
+            for field, seen_words in failures.score_failure(verdict).items()
         }
-        if words == failures.score_failure(seen):
-            return seen
-        if score is not None and parse_command_uuid(score) != seen.uuid:
+        if texts == failures.score_failure(verdict):
+            return verdict
+        if score is not None and parse_command_uuid(score) != verdict.uuid:
             raise Conflict(
                 _TRIAL_SCORED_ANEW_BY_MEANWHILE(
-                    trial=held.pk, user=seen.rater.get_username(), why=seen.why or f"failure {UNSPECIFIED}"
+                    trial=locked.pk,
+                    user=verdict.rater.get_username(),
+                    why=verdict.why or f"failure {UNSPECIFIED}",
                 )
             )
-        after = failure_text(words["failure_phase"], words["failure"])
-        why = reason or f"failure was {seen.why or UNSPECIFIED}, now {after or UNSPECIFIED}"
-        found = _reworded(
-            user, held, seen, failures.clean_failure(**words), clean_text("reason", why, LONGEST_NOTE)
+        after = failure_text(texts["failure_phase"], texts["failure"])
+        text = reason or f"failure was {verdict.why or UNSPECIFIED}, now {after or UNSPECIFIED}"
+        reworded = _reworded(
+            user, locked, verdict, failures.clean_failure(**texts), clean_text("reason", text, LONGEST_NOTE)
         )
     trial.refresh_from_db()
-    return found
+    return reworded
 
 
-def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], reason: str) -> Score:
+def _reworded(user: User, trial: Trial, verdict: Score, texts: Mapping[str, str], reason: str) -> Score:
     """Add a copy of the score `seen` with other words for the failure.
 
     Its milestones are copied too, even if the scene's milestones have changed since.
     """
-    for what in ("scored", "reworded"):
-        run_checks(what, held, user)
-    require_scorable(held, reason)
-    failures.check_failure(held.scene, words, success=seen.success, said=failures.score_failure(seen))
-    found = Score(
-        trial=held,
+    for check in ("scored", "reworded"):
+        run_checks(check, trial, user)
+    require_scorable(trial, reason)
+    failures.check_failure(trial.scene, texts, success=verdict.success, said=failures.score_failure(verdict))
+    score = Score(
+        trial=trial,
         rater=user,
-        success=seen.success,
-        score=seen.score,
-        note=seen.note,
+        success=verdict.success,
+        score=verdict.score,
+        note=verdict.note,
         reason=reason,
-        **words,
+        **texts,
     )
     outcomes = [
         MilestoneOutcome(
-            score=found,
+            score=score,
             milestone_id=row.milestone_id,
             order=row.order,
             text=row.text,
@@ -103,7 +105,7 @@ def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], re
             reached=row.reached,
             at_s=row.at_s,
         )
-        for row in seen.outcomes.all()
+        for row in verdict.outcomes.all()
     ]
-    counts_now(held, found, outcomes, user)
-    return found
+    counts_now(trial, score, outcomes, user)
+    return score

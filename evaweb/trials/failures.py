@@ -58,15 +58,15 @@ def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
     `said` maps each field to the selected term, which is included even if it is retired or deleted. A level without
     terms is omitted.
     """
-    terms, found = list(FailureTerm.objects.filter(active=True)), []
+    terms, levels = list(FailureTerm.objects.filter(active=True)), []
     for field, level in FIELDS.items():
         before = (said or {}).get(field, "")
-        known = [Choice(row.words, row.key, row.words == before) for row in terms if row.level == level]
-        if before and not any(choice.is_selected for choice in known):
-            known.append(Choice(before, "", True))
-        if known:
-            found.append(Level(field, level.label.capitalize(), tuple(known)))
-    return tuple(found)
+        choices = [Choice(row.words, row.key, row.words == before) for row in terms if row.level == level]
+        if before and not any(choice.is_selected for choice in choices):
+            choices.append(Choice(before, "", True))
+        if choices:
+            levels.append(Level(field, level.label.capitalize(), tuple(choices)))
+    return tuple(levels)
 
 
 def score_failure(score: Score | None) -> dict[str, str]:
@@ -77,19 +77,19 @@ def score_failure(score: Score | None) -> dict[str, str]:
 def ordered_terms() -> Mapping[str, tuple[str, ...]]:
     """Return by field the terms of each level, including retired ones, in the lab's order."""
     rows = FailureTerm.objects.values_list("level", "words")
-    return {field: tuple(words for of, words in rows if of == level) for field, level in FIELDS.items()}
+    return {field: tuple(text for of, text in rows if of == level) for field, level in FIELDS.items()}
 
 
 def clean_failure(*, failure_phase: str, failure: str) -> dict[str, str]:
     """Return phase and cause in the form in which they are stored. Raises: EvaError if they cannot be stored."""
-    found = {
+    texts = {
         "failure": clean_text("failure", failure, LONGEST_FAILURE),
         "failure_phase": clean_text("failure_phase", failure_phase, LONGEST_FAILURE),
     }
-    for field, words in found.items():
-        if is_unspecified(words):
-            raise EvaError(_ALLOWED_OTHER_WORDS_NONE_WHERE(field=field, words=words))
-    return found
+    for field, text in texts.items():
+        if is_unspecified(text):
+            raise EvaError(_ALLOWED_OTHER_WORDS_NONE_WHERE(field=field, words=text))
+    return texts
 
 
 def check_failure(
@@ -109,16 +109,16 @@ def check_failure(
     for field in FIELDS if success else ():
         if words[field]:
             raise EvaError(_BUT_TRIAL_SUCCESS_LEAVE_EMPTY(field=field, words=words[field]))
-    wanted = scene.failure_required and by_person and not success
-    if not (wanted or any(words[field] for field in FIELDS)):
+    required = scene.failure_required and by_person and not success
+    if not (required or any(words[field] for field in FIELDS)):
         return
     offers = {level.field: [choice.words for choice in level.choices] for level in failure_choices(said)}
     for field in FIELDS:
         value, allowed = words[field], offers.get(field, [])
-        if wanted and allowed and not value:
+        if required and allowed and not value:
             raise EvaError(
                 _MISSING_SCENE_WANTS_EVERY_FAILED(field=field, name=scene.name, allowed=", ".join(allowed))
             )
-        listed = wanted or field == "failure_phase" or words["failure_phase"]
+        listed = required or field == "failure_phase" or words["failure_phase"]
         if listed and value and value not in allowed:
             raise EvaError(f"{field} = {value!r}; allowed: {', '.join(allowed) or 'none, the lab has none'}")

@@ -68,11 +68,11 @@ class FailureFilters:
     @property
     def query(self) -> str:
         """Filters as a URL query string."""
-        said = {
+        values = {
             **asdict(self.trials),
             **{name: getattr(self, name) for name in ("position", *_WORDS, "group")},
         }
-        return urlencode({name: value for name, value in said.items() if value})
+        return urlencode({name: value for name, value in values.items() if value})
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +107,8 @@ def failure_groups(filters: FailureFilters, sight: Visibility) -> list[Group]:
     """Return the groups, largest first."""
     keys = list(_keys(filters.group, sight))
     rows = failed_list(filters, sight).order_by().values_list(*keys).annotate(n=Count("pk"))
-    found = [Group(_named(filters.group, key), n, _alone(filters, key)) for *key, n in rows]
-    return sorted(found, key=lambda group: (-group.count, group.name))
+    groups = [Group(_named(filters.group, key), n, _alone(filters, key)) for *key, n in rows]
+    return sorted(groups, key=lambda group: (-group.count, group.name))
 
 
 def failures_of(keys: Sequence[int], filters: FailureFilters, sight: Visibility) -> list[Trial]:
@@ -165,12 +165,12 @@ def row_of(trial: Trial, sight: Visibility, root: str) -> dict[str, Any]:
     }
 
 
-def _keys(group: str, sight: Visibility) -> dict[str, Any]:
+def _keys(group: str, visibility: Visibility) -> dict[str, Any]:
     """Return the two expressions by which trials are grouped and sorted; the first puts unnamed groups last."""
     if group == "position":
         return {"group_scene": F("scene__name"), "group_number": F("position__number")}
     if group == "checkpoint":
-        hidden = Q(checkpoint__in=sight.checkpoints)
+        hidden = Q(checkpoint__in=visibility.checkpoints)
         return {
             "group_last": _true(hidden),
             "group_words": Case(

@@ -28,13 +28,13 @@ _TRIALS = ("evaluation", "checkpoint", "scene", "station", "since")
 @require_GET
 def failure_gallery(request: HttpRequest) -> HttpResponse:
     """Show the clips of failed trials by group; the filters are in the URL."""
-    seen, filters, fault = visibility_for_request(request), _filters(request.GET), None
+    visibility, filters, fault = visibility_for_request(request), _filters(request.GET), None
     try:
-        groups = gallery.failure_groups(filters, seen)
+        groups = gallery.failure_groups(filters, visibility)
     except EvaError as problem:
         fault, filters = problem, FailureFilters()
-        groups = gallery.failure_groups(filters, seen)
-    paginator = Paginator(gallery.failed_list(filters, seen).values_list("pk", flat=True), PER_PAGE)
+        groups = gallery.failure_groups(filters, visibility)
+    paginator = Paginator(gallery.failed_list(filters, visibility).values_list("pk", flat=True), PER_PAGE)
     paginator.count = sum(group.count for group in groups)  # type: ignore[misc]  # no second pass over all trials
     page = paginator.get_page(request.GET.get("page"))
     counts = {group.name: group.count for group in groups}
@@ -45,17 +45,17 @@ def failure_gallery(request: HttpRequest) -> HttpResponse:
                 "trial": trial,
                 "group": (name := gallery.shown_group(trial, filters)),
                 "count": counts.get(name, 0),
-                "checkpoint": seen.checkpoint_label(trial),
+                "checkpoint": visibility.checkpoint_label(trial),
                 "clip": (clip := clip_of(trial)),
                 "address": clip.share if clip else reverse("result-trial", args=[trial.pk]),
                 "stage": playback_stage(episode=trial.episode) if trial.episode else None,
             }
-            for trial in gallery.failures_of(list(page), filters, seen)
+            for trial in gallery.failures_of(list(page), filters, visibility)
         ],
         "groups": groups,
         "evaluations": evaluation_list(),
         "scenes": scene_list(all_of_them=True).prefetch_related(None),
-        "checkpoints": checkpoint_list(all_of_them=True, sight=seen),
+        "checkpoints": checkpoint_list(all_of_them=True, sight=visibility),
         "by": gallery.GROUPS,
         "filters": filters,
         "most_clips": clip_export.MOST,
@@ -70,27 +70,27 @@ def failure_gallery(request: HttpRequest) -> HttpResponse:
 @require_GET
 def failure_table(request: HttpRequest) -> StreamingHttpResponse:
     """Return all filtered failures as CSV with the URL of each clip."""
-    seen, filters = visibility_for_request(request), _filters(request.GET)
-    gallery.failed_list(filters, seen)  # reports invalid filters before the response begins
+    visibility, filters = visibility_for_request(request), _filters(request.GET)
+    gallery.failed_list(filters, visibility)  # reports invalid filters before the response begins
     root = request.build_absolute_uri("/").rstrip("/")
-    pieces = iter_csv(gallery.COLUMNS, gallery.failure_rows(filters, seen, root))
+    pieces = iter_csv(gallery.COLUMNS, gallery.failure_rows(filters, visibility, root))
     return download(request, pieces, "failures.csv", CSV)
 
 
 @require_GET
 def failure_clips(request: HttpRequest) -> StreamingHttpResponse:
     """Return the clips and their table as a zip archive, generated while it is sent."""
-    seen, filters = visibility_for_request(request), _filters(request.GET)
-    clip_export.require_few(filters, seen)
+    visibility, filters = visibility_for_request(request), _filters(request.GET)
+    clip_export.require_few(filters, visibility)
     root = request.build_absolute_uri("/").rstrip("/")
-    pieces = clip_export.clip_archive(filters, seen, root)
+    pieces = clip_export.clip_archive(filters, visibility, root)
     return download(request, pieces, "failures.zip", "application/zip")
 
 
-def _filters(given: Mapping[str, str]) -> FailureFilters:
-    said = {name: given.get(name, "").strip() for name in (*_TRIALS, "position", *failures.FIELDS)}
+def _filters(query: Mapping[str, str]) -> FailureFilters:
+    values = {name: query.get(name, "").strip() for name in (*_TRIALS, "position", *failures.FIELDS)}
     return FailureFilters(
-        trials=TrialFilters(**{name: said.pop(name) for name in _TRIALS}),
-        group=given.get("group", "").strip() or "failure",
-        **said,
+        trials=TrialFilters(**{name: values.pop(name) for name in _TRIALS}),
+        group=query.get("group", "").strip() or "failure",
+        **values,
     )

@@ -237,12 +237,12 @@ class Checkpoint(models.Model):
     @property
     def lineage(self) -> list[Checkpoint]:
         """Ancestors in training, nearest first."""
-        found: list[Checkpoint] = []
+        ancestors: list[Checkpoint] = []
         above = self.parent
-        while above is not None and above not in found:
-            found.append(above)
+        while above is not None and above not in ancestors:
+            ancestors.append(above)
             above = above.parent
-        return found
+        return ancestors
 
     def clean(self) -> None:
         """Raise ValidationError if the parent was itself trained from this checkpoint."""

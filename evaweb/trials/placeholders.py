@@ -24,44 +24,44 @@ def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
     The station's open bench has one row for all versions; its version is raised to the trial's.
     """
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
-        found, _ = Evaluation.objects.get_or_create(
+        row, _ = Evaluation.objects.get_or_create(
             name=facts.evaluation, version=facts.version, defaults={"description": PLACEHOLDER_NOTE}
         )
-        return found
-    found = open_bench(station)
-    if found.version < facts.version:
-        found.version = facts.version
-        found.save()
-    return found
+        return row
+    row = open_bench(station)
+    if row.version < facts.version:
+        row.version = facts.version
+        row.save()
+    return row
 
 
 def checkpoint(facts: TrialRecord) -> Checkpoint:
     """Return the trial's checkpoint, found by name; a created one is inactive."""
-    words = f"{PLACEHOLDER_NOTE} Say again how it is reached, then switch it on."
-    found, _ = Checkpoint.objects.get_or_create(
-        name=facts.checkpoint, defaults={"description": words, "active": False}
+    note = f"{PLACEHOLDER_NOTE} Say again how it is reached, then switch it on."
+    row, _ = Checkpoint.objects.get_or_create(
+        name=facts.checkpoint, defaults={"description": note, "active": False}
     )
-    return found
+    return row
 
 
 def scene(facts: TrialRecord) -> Scene:
     """Return the trial's scene, found by name; a created one gets its milestones from the first restored score."""
-    words = f"{PLACEHOLDER_NOTE} Write down again what counts as success, then switch it on."
-    found, _ = Scene.objects.get_or_create(
+    note = f"{PLACEHOLDER_NOTE} Write down again what counts as success, then switch it on."
+    row, _ = Scene.objects.get_or_create(
         name=facts.scene,
         defaults={
             "title": facts.scene,
             "instruction": facts.instruction,
-            "criterion": words,
+            "criterion": note,
             "time_limit_s": facts.time_limit_s,
             "active": False,
         },
     )
-    return found
+    return row
 
 
 def position(scene: Scene, number: int) -> Position:
     """Return the scene's position of that number."""
-    words = f"{PLACEHOLDER_NOTE} Write down again where things stand."
-    found, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": words})
-    return found
+    note = f"{PLACEHOLDER_NOTE} Write down again where things stand."
+    row, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": note})
+    return row

@@ -46,17 +46,17 @@ def rate_bar(found: Proportion) -> Bar | None:
     """Return the bar of a proportion; None if its rate is unknown."""
     if found.rate is None or found.interval is None:
         return None
-    words = f"{format_percent(found.rate)} of {found.n}, 95 % interval {format_interval(found)}"
-    return Bar(_x(found.rate), _x(found.interval.low), _x(found.interval.high), words)
+    text = f"{format_percent(found.rate)} of {found.n}, 95 % interval {format_interval(found)}"
+    return Bar(_x(found.rate), _x(found.interval.low), _x(found.interval.high), text)
 
 
 def scene_figures(rows: Iterable[StatisticsRow]) -> list[SceneFigure]:
     """Return one figure per scene, in the order of the rows."""
     figures = []
     for _, group in groupby(rows, key=lambda row: row.scene.pk):
-        found = list(group)
-        drawn = tuple((row, rate_bar(row.summary.success)) for row in found)
-        figures.append(SceneFigure(found[0].scene, drawn, sum(row.summary.success.n for row in found)))
+        members = list(group)
+        drawn = tuple((row, rate_bar(row.summary.success)) for row in members)
+        figures.append(SceneFigure(members[0].scene, drawn, sum(row.summary.success.n for row in members)))
     return figures
 
 

@@ -237,7 +237,7 @@ class ScoreLine(Line):
     @field_validator("milestones")
     @classmethod
     def _once(cls, milestones: tuple[OutcomeLine, ...]) -> tuple[OutcomeLine, ...]:
-        if len({each.order for each in milestones}) < len(milestones):
+        if len({milestone.order for milestone in milestones}) < len(milestones):
             raise ValueError("allowed: each milestone once")
         return milestones
 

@@ -66,46 +66,46 @@ _GHOST_S = 0.1  # runs that never began have durations of a few hundredths of a 
 @register_restorer
 def restore(kept: RestorableRun) -> int:
     """Restore the trial of a run and its scores if they are missing; return the number of restored rows."""
-    asked = read_recorded_episode(journal_folder(kept.uuid)).trial if kept.recorded else {}
-    lines = _judgements(kept, asked)
+    request = read_recorded_episode(journal_folder(kept.uuid)).trial if kept.recorded else {}
+    lines = _judgements(kept, request)
     if not lines and Trial.objects.filter(episode_id=kept.uuid).exclude(status__in=_BEHIND).exists():
         return 0
-    facts = _facts(lines, asked)
+    facts = _facts(lines, request)
     episode = Episode.objects.filter(uuid=kept.uuid).first()
     if facts is None or not (lines or (episode is not None and episode.status in CLOSED)):
         return 0
     with transaction.atomic():
-        trial, made = _trial(facts, kept, episode)
+        trial, created = _trial(facts, kept, episode)
         scores = _scores(trial, [line for line in lines if isinstance(line, ScoreLine)])
         _apply_outcomes(trial, lines)
         scores += _restore_void_requests(trial, lines)
-        if made or scores:
-            _publish(trial, made=made)
+        if created or scores:
+            _publish(trial, made=created)
     if never := _never_ran_reason(trial):
         kept.report_problem(never)
-    return made + scores
+    return created + scores
 
 
 def _never_ran_reason(trial: Trial) -> str:
     """Return a warning for a scored trial whose recording was never opened, which earlier versions allowed; else ""."""
     if trial.status != TrialStatus.SCORED or trial.episode is None or (trial.duration_s or 0.0) >= _GHOST_S:
         return ""
-    why = why_unrecorded(episode=trial.episode)
-    return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
+    reason = why_unrecorded(episode=trial.episode)
+    return reason and f"trial {trial.pk} is scored and never ran, {reason}: void it with a reason"
 
 
-def _judgements(kept: RestorableRun, asked: Mapping[str, Any]) -> list[Judgement]:
+def _judgements(run: RestorableRun, request: Mapping[str, Any]) -> list[Judgement]:
     """Return the lines of the run's scores file that belong to its trial, the last one for each score's uuid.
 
     A score was written twice if its first write to the database failed. Lines of another trial than the recording's,
     from a copied file, are reported and skipped.
     """
-    lines = [line for line in kept.lines if isinstance(line, Judgement)]
-    own = asked.get("uuid", "")
-    foreign = [str(line.trial.uuid) for line in lines if kept.recorded and str(line.trial.uuid) != own]
+    lines = [line for line in run.lines if isinstance(line, Judgement)]
+    own = request.get("uuid", "")
+    foreign = [str(line.trial.uuid) for line in lines if run.recorded and str(line.trial.uuid) != own]
     if foreign:
-        kept.report_problem(
-            f"run {kept.uuid}: {len(foreign)} of its scores are of trial {', '.join(dict.fromkeys(foreign))}, "
+        run.report_problem(
+            f"run {run.uuid}: {len(foreign)} of its scores are of trial {', '.join(dict.fromkeys(foreign))}, "
             f"its recording is of {f'trial {own}' if own else 'no trial'}: left out"
         )
     lines = [line for line in lines if str(line.trial.uuid) not in foreign]
@@ -113,42 +113,42 @@ def _judgements(kept: RestorableRun, asked: Mapping[str, Any]) -> list[Judgement
     return [line for line in lines if not isinstance(line, ScoreLine) or line is last[line.uuid]]
 
 
-def _facts(lines: Sequence[Judgement], asked: Mapping[str, Any]) -> TrialRecord | None:
+def _facts(lines: Sequence[Judgement], request: Mapping[str, Any]) -> TrialRecord | None:
     """Return the trial's record: from the newest line, which is most complete, else from the manifest."""
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
         raise EvaError(_SCORES_SEVERAL_TRIALS(named=", ".join(sorted(map(str, named)))))
-    return lines[-1].trial if lines else trial_of_manifest(asked)
+    return lines[-1].trial if lines else trial_of_manifest(request)
 
 
 # --- the trial ---------------------------------------------------------------------------------------------
 
 
-def _trial(facts: TrialRecord, kept: RestorableRun, episode: Episode | None) -> tuple[Trial, bool]:
+def _trial(facts: TrialRecord, run: RestorableRun, episode: Episode | None) -> tuple[Trial, bool]:
     """Return the trial's row, locked, and whether it was created."""
     trial = Trial.objects.select_for_update().filter(uuid=facts.uuid).first()
     if trial is None:
-        return _create(facts, _episode(facts, kept, episode)), True
-    if kept.uuid not in (trial.uuid, trial.episode_id or kept.uuid):
+        return _create(facts, _episode(facts, run, episode)), True
+    if run.uuid not in (trial.uuid, trial.episode_id or run.uuid):
         raise EvaError(_TRIAL_HAS_EPISODE_CANNOT_HAVE(trial=trial.pk, episode_id=trial.episode_id))
     if trial.status in _BEHIND:
-        for name, value in _run_values(facts, _episode(facts, kept, episode)).items():
+        for name, value in _run_values(facts, _episode(facts, run, episode)).items():
             setattr(trial, name, value)
         log.warning("trial %s was behind its recording: it is %s now", trial.pk, trial.status)
         trial.save()
-    elif trial.episode is None and (found := _episode(facts, kept, episode)):
-        trial.episode = found
+    elif trial.episode is None and (own_episode := _episode(facts, run, episode)):
+        trial.episode = own_episode
         trial.save()
     return trial, False
 
 
-def _episode(facts: TrialRecord, kept: RestorableRun, found: Episode | None) -> Episode | None:
+def _episode(facts: TrialRecord, run: RestorableRun, episode: Episode | None) -> Episode | None:
     """Return the recording, created as missing if its folder is lost too; None for a trial without recording."""
-    if found is not None or kept.uuid == facts.uuid:
-        return found
+    if episode is not None or run.uuid == facts.uuid:
+        return episode
     return episodes.create_missing_episode(
         station=placeholders.station(facts),
-        uuid=kept.uuid,
+        uuid=run.uuid,
         task=facts.instruction,
         checkpoint=facts.checkpoint,
         operator=facts.operator,
@@ -217,8 +217,8 @@ def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
         return None, None
     folder = journal_folder(episode.uuid)
     events = (json.loads(line) for line in read_events(folder / "events.jsonl").lines)
-    told = [event.get("data") for event in events if event.get("kind") == "truth"]
-    return read_recorded_episode(folder).ended_at, told[-1] if told else None
+    truths = [event.get("data") for event in events if event.get("kind") == "truth"]
+    return read_recorded_episode(folder).ended_at, truths[-1] if truths else None
 
 
 # --- scores and voids --------------------------------------------------------------------------------------
@@ -240,17 +240,19 @@ def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
 
     A trial has two files if its episode was found late. If a later score is in the other file, that one counts.
     """
-    newest, known = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
-    elsewhere = known is not None and known.uuid not in [line.uuid for line in lines]
-    return known if known and elsewhere and known.scored_at > newest.scored_at else newest
+    newest, current = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
+    elsewhere = current is not None and current.uuid not in [line.uuid for line in lines]
+    return current if current and elsewhere and current.scored_at > newest.scored_at else newest
 
 
 def _score(trial: Trial, line: ScoreLine) -> None:
     score = Score.objects.create(trial=trial, **line.to_row_values())
-    known = _milestones(trial.scene, line.milestones)
+    by_key = _milestones(trial.scene, line.milestones)
     MilestoneOutcome.objects.bulk_create(
-        MilestoneOutcome(score=score, milestone=known.get((each.order, each.text)), **each.to_row_values())
-        for each in line.milestones
+        MilestoneOutcome(
+            score=score, milestone=by_key.get((outcome.order, outcome.text)), **outcome.to_row_values()
+        )
+        for outcome in line.milestones
     )
 
 
@@ -264,23 +266,23 @@ def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int
         and scene.criterion.startswith(placeholders.PLACEHOLDER_NOTE)
         and not scene.milestones.exists()
     ):
-        for each in outcomes:
-            Milestone.objects.create(scene=scene, **each.model_dump(exclude={"reached", "at_s"}))
+        for outcome in outcomes:
+            Milestone.objects.create(scene=scene, **outcome.model_dump(exclude={"reached", "at_s"}))
     return {(milestone.order, milestone.text): milestone for milestone in scene.milestones.all()}
 
 
 def _apply_outcomes(trial: Trial, lines: Sequence[Judgement]) -> None:
     """Set the status that follows from the lines; a void is final."""
     void = next((line for line in lines if isinstance(line, VoidLine)), None)
-    asked = [line for line in lines if isinstance(line, VoidRequestLine | VoidAnswerLine)]
+    requests = [line for line in lines if isinstance(line, VoidRequestLine | VoidAnswerLine)]
     if void is not None and trial.status != TrialStatus.VOIDED:
         for name, value in {"status": TrialStatus.VOIDED, **void.to_row_values()}.items():
             setattr(trial, name, value)
         trial.save()
     elif void is None and lines:
-        waits = bool(asked) and isinstance(asked[-1], VoidRequestLine)
+        waits = bool(requests) and isinstance(requests[-1], VoidRequestLine)
         status = TrialStatus.VOID_ASKED if waits else TrialStatus.SCORED
-        if trial.status not in lifecycle.SCORED_STATES or (asked and trial.status != status):
+        if trial.status not in lifecycle.SCORED_STATES or (requests and trial.status != status):
             trial.status = status
             trial.save()
 
@@ -288,15 +290,15 @@ def _apply_outcomes(trial: Trial, lines: Sequence[Judgement]) -> None:
 def _restore_void_requests(trial: Trial, lines: Sequence[Judgement]) -> int:
     """Restore missing void requests and answers; return the number of added or updated rows."""
     answers = {line.uuid: line.to_row_values() for line in lines if isinstance(line, VoidAnswerLine)}
-    asked = missing_rows(
+    missing = missing_rows(
         VoidRequest, [line for line in lines if isinstance(line, VoidRequestLine)], trial=trial
     )
-    for line in asked:
+    for line in missing:
         VoidRequest.objects.create(trial=trial, **line.to_row_values(), **answers.get(line.uuid, {}))
     behind = VoidRequest.objects.filter(uuid__in=answers, answer="")
     for row in behind:
         VoidRequest.objects.filter(pk=row.pk).update(**answers[row.uuid])
-    return len(asked) + len(behind)
+    return len(missing) + len(behind)
 
 
 def _publish(trial: Trial, *, made: bool) -> None:

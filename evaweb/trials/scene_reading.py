@@ -85,27 +85,27 @@ def scene_table(scene: Scene) -> dict[str, Any]:
 
 def scene_digest(scene: Scene) -> str:
     """Return a digest of the scene as stored, which changes with any part of it."""
-    kept = scene_table(Scene.objects.get(pk=scene.pk))
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
+    table = scene_table(Scene.objects.get(pk=scene.pk))
+    return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def protected_positions(scene: Scene) -> dict[int, str]:
     """Return by id the positions used by trials or frozen plans, with the reason as text."""
     referred = Q(trials__isnull=False) | Q(plan__state__in=_FROZEN)
     rows = scene.positions.filter(referred).annotate(n=Count("trials", distinct=True)).distinct()
-    found = {}
+    reasons = {}
     for row in rows.prefetch_related("plan_set"):
         plans = [str(plan) for plan in row.plan_set.all() if plan.state in _FROZEN]  # type: ignore[attr-defined]
         trials = [f"{row.n} trial{'s' if row.n > 1 else ''}"] if row.n else []
-        found[row.pk] = " and ".join([*trials, *(f"plan {plan}" for plan in plans)])
-    return found
+        reasons[row.pk] = " and ".join([*trials, *(f"plan {plan}" for plan in plans)])
+    return reasons
 
 
 def running_plans(scene: Scene) -> list[str]:
     """Return the titles of running plans that use the scene."""
     rows = scene.positions.filter(plan__state="frozen").order_by("plan__title", "plan__version")
-    found = rows.values_list("plan__title", "plan__version").distinct()
-    return [f"{title} v{version}" for title, version in found]
+    versions = rows.values_list("plan__title", "plan__version").distinct()
+    return [f"{title} v{version}" for title, version in versions]
 
 
 def values_of(row: models.Model, names: Iterable[str]) -> dict[str, Any]:

@@ -98,41 +98,41 @@ def scene_write(
         ChangedMeanwhile: Another user has changed the scene; nothing is written.
     """
     require_role(user, Role.ADMIN)
-    wanted = table_of(given)
+    table = table_of(given)
     scene = Scene.objects.select_for_update().filter(name=name).first() if name is not None else Scene()
     if scene is None:
         raise Conflict(_SCENE_DOES_NOT_EXIST_ANY(name=name))
-    there = scene if name is not None else Scene.objects.filter(name=wanted.name).first()
-    if there is not None and _equals(there, wanted):
-        return there, []
+    existing = scene if name is not None else Scene.objects.filter(name=table.name).first()
+    if existing is not None and _equals(existing, table):
+        return existing, []
     if name is None:
-        scene.name = wanted.name
+        scene.name = table.name
     elif scene_digest(scene) != seen:
         raise ChangedMeanwhile(scene, scene_digest(scene))
     before = scene_table(scene) if scene.pk else None
-    faults = _assigned(scene, wanted)
+    faults = _assigned(scene, table)
     if faults:
         raise SceneRefused(faults)
     scene.save()
-    faults = [*_write_positions(scene, wanted.positions), *_write_milestones(scene, wanted.milestones)]
+    faults = [*_write_positions(scene, table.positions), *_write_milestones(scene, table.milestones)]
     if faults:
         raise SceneRefused(faults)
     after = scene_table(scene)
     if after != before:
-        flag, what = (CHANGE, _changed(before, after)) if before else (ADDITION, "made in the scene editor")
-        LogEntry.objects.log_actions(user.pk, [scene], flag, what, single_object=True)
+        flag, text = (CHANGE, _changed(before, after)) if before else (ADDITION, "made in the scene editor")
+        LogEntry.objects.log_actions(user.pk, [scene], flag, text, single_object=True)
     return scene, _remarks(scene, before, after)
 
 
-def _equals(scene: Scene, wanted: SceneTable) -> bool:
-    """Return True if the scene already equals `wanted`, in which new rows have no id."""
-    there = SceneTable.model_validate(scene_table(scene))
+def _equals(scene: Scene, table: SceneTable) -> bool:
+    """Return True if the scene already equals `table`, in which new rows have no id."""
+    stored = SceneTable.model_validate(scene_table(scene))
     pairs = (
-        zip(there.positions, wanted.positions, strict=False),
-        zip(there.milestones, wanted.milestones, strict=False),
+        zip(stored.positions, table.positions, strict=False),
+        zip(stored.milestones, table.milestones, strict=False),
     )
-    same = all(asked.id in (None, row.id) for pair in pairs for row, asked in pair)
-    return same and there.model_dump(exclude=_IDS) == wanted.model_dump(exclude=_IDS)
+    same = all(requested.id in (None, row.id) for pair in pairs for row, requested in pair)
+    return same and stored.model_dump(exclude=_IDS) == table.model_dump(exclude=_IDS)
 
 
 def table_of(given: object) -> SceneTable:
@@ -142,55 +142,56 @@ def table_of(given: object) -> SceneTable:
     except ValidationError as error:
         faults = [
             Fault(
-                place := ".".join(map(str, one["loc"])) or "scene",
-                f"{place} = {one['input']!r:.60}: {one['msg']}",
+                place := ".".join(map(str, fault["loc"])) or "scene",
+                f"{place} = {fault['input']!r:.60}: {fault['msg']}",
             )
-            for one in error.errors()
+            for fault in error.errors()
         ]
         raise SceneRefused(faults) from None
 
 
-def _assigned(scene: Scene, wanted: SceneTable) -> list[Fault]:
+def _assigned(scene: Scene, table: SceneTable) -> list[Fault]:
     for name in FIELDS:
-        setattr(scene, name, getattr(wanted, name))
+        setattr(scene, name, getattr(table, name))
     faults = _faults(scene, "", "")
-    if not wanted.positions:
+    if not table.positions:
         faults.append(Fault("positions", "positions: none; allowed: at least one, from which a trial begins"))
     return faults
 
 
-def _write_positions(scene: Scene, wanted: Sequence[PositionTable]) -> list[Fault]:
+def _write_positions(scene: Scene, tables: Sequence[PositionTable]) -> list[Fault]:
     rows = {row.pk: row for row in scene.positions.all()}
-    kept = protected_positions(scene)
-    faults = [*_strangers(wanted, rows, "positions"), *_twice(wanted)]
+    protected = protected_positions(scene)
+    faults = [*_strangers(tables, rows, "positions"), *_twice(tables)]
     faults += [
-        Fault("positions", f"position {row.number} is not removed, because of {why}")
+        Fault("positions", f"position {row.number} is not removed, because of {reason}")
         for row in rows.values()
-        if row.pk not in {one.id for one in wanted} and (why := kept.get(row.pk) or _pictured(row))
+        if row.pk not in {table.id for table in tables}
+        and (reason := protected.get(row.pk) or _pictured(row))
     ]
     if faults:
         return faults
-    scene.positions.exclude(pk__in=[one.id for one in wanted if one.id]).delete()
-    for index, one in enumerate(wanted):
-        row = rows[one.id] if one.id else Position(scene=scene)
-        asked = one.model_dump(include=set(POSITION))
-        if not one.id or _plain(values_of(row, POSITION)) != _plain(asked):
-            faults += _position_written(row, asked, f"positions.{index}", kept.get(row.pk, ""))
+    scene.positions.exclude(pk__in=[table.id for table in tables if table.id]).delete()
+    for index, table in enumerate(tables):
+        row = rows[table.id] if table.id else Position(scene=scene)
+        values = table.model_dump(include=set(POSITION))
+        if not table.id or _plain(values_of(row, POSITION)) != _plain(values):
+            faults += _position_written(row, values, f"positions.{index}", protected.get(row.pk, ""))
     return faults
 
 
-def _position_written(row: Position, asked: Mapping[str, Any], place: str, kept: str) -> list[Fault]:
-    what = f"position {asked['number']}"
-    if kept:
-        told = f"position {row.number} is not changed, because of {kept}: add another position instead"
-        return [Fault(place, told)]
-    if row.pk and row.number != asked["number"]:
+def _position_written(row: Position, values: Mapping[str, Any], place: str, protection: str) -> list[Fault]:
+    label = f"position {values['number']}"
+    if protection:
+        text = f"position {row.number} is not changed, because of {protection}: add another position instead"
+        return [Fault(place, text)]
+    if row.pk and row.number != values["number"]:
         return [Fault(place, f"position {row.number}: its number stays, for seeds and exports have it")]
-    for name, value in asked.items():
+    for name, value in values.items():
         setattr(row, name, value)
-    faults = _faults(row, f"{place}.", what)
+    faults = _faults(row, f"{place}.", label)
     if not faults and (problem := _bench_problem(row.bench or {})):
-        faults = [Fault(f"{place}.bench", f"{what}: {problem}")]
+        faults = [Fault(f"{place}.bench", f"{label}: {problem}")]
     if not faults:
         row.save()
     return faults
@@ -215,24 +216,24 @@ def _bench_problem(bench: Mapping[str, Any]) -> str:
     return ""
 
 
-def _write_milestones(scene: Scene, wanted: Sequence[MilestoneTable]) -> list[Fault]:
+def _write_milestones(scene: Scene, tables: Sequence[MilestoneTable]) -> list[Fault]:
     rows = {row.pk: row for row in scene.milestones.all()}
-    faults = _strangers(wanted, rows, "milestones")
-    texts = [one.text for one in wanted if one.text]
-    if any(not one.id or (one.id in rows and rows[one.id].text != one.text) for one in wanted):
+    faults = _strangers(tables, rows, "milestones")
+    texts = [table.text for table in tables if table.text]
+    if any(not table.id or (table.id in rows and rows[table.id].text != table.text) for table in tables):
         try:
             check_milestones(texts)
         except Invalid as invalid:
             faults.append(Fault("milestones", f"milestones: {'; '.join(invalid.messages)}"))
     if faults:
         return faults
-    scene.milestones.exclude(pk__in=[one.id for one in wanted if one.id]).delete()
-    _make_room(scene, len(wanted))
-    for index, one in enumerate(wanted):
-        row = rows[one.id] if one.id else Milestone(scene=scene)
+    scene.milestones.exclude(pk__in=[table.id for table in tables if table.id]).delete()
+    _make_room(scene, len(tables))
+    for index, table in enumerate(tables):
+        row = rows[table.id] if table.id else Milestone(scene=scene)
         row.order = index + 1
         for name in MILESTONE:
-            setattr(row, name, getattr(one, name))
+            setattr(row, name, getattr(table, name))
         problems = _faults(row, f"milestones.{index}.", f"milestone {index + 1}")
         faults += problems
         if not problems:
@@ -245,8 +246,8 @@ def _make_room(scene: Scene, n: int) -> None:
 
     The order so stays unique while the milestones are then moved to their new places one by one.
     """
-    taken = set(scene.milestones.values_list("order", flat=True))
-    free = (place for place in count(n + 1) if place not in taken)
+    used = set(scene.milestones.values_list("order", flat=True))
+    free = (place for place in count(n + 1) if place not in used)
     for row in scene.milestones.all():
         scene.milestones.filter(pk=row.pk).update(order=next(free))
 
@@ -259,9 +260,9 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     return {**values, **texts}
 
 
-def _strangers(wanted: Sequence[Any], rows: Mapping[int, Any], kind: str) -> list[Fault]:
+def _strangers(tables: Sequence[Any], rows: Mapping[int, Any], kind: str) -> list[Fault]:
     """Return a fault for each id in `wanted` that is not a row of this scene, or occurs twice."""
-    ids = [one.id for one in wanted if one.id is not None]
+    ids = [table.id for table in tables if table.id is not None]
     wrong = [id for id in ids if id not in rows or ids.count(id) > 1]
     return [
         Fault(kind, f"{kind}: id {id} is not one of this scene, or there twice")
@@ -269,11 +270,12 @@ def _strangers(wanted: Sequence[Any], rows: Mapping[int, Any], kind: str) -> lis
     ]
 
 
-def _twice(wanted: Sequence[PositionTable]) -> list[Fault]:
-    numbers = [one.number for one in wanted]
-    twice = sorted({number for number in numbers if numbers.count(number) > 1})
+def _twice(tables: Sequence[PositionTable]) -> list[Fault]:
+    numbers = [table.number for table in tables]
+    repeated = sorted({number for number in numbers if numbers.count(number) > 1})
     return [
-        Fault("positions", f"two positions have the number {number}; allowed: each once") for number in twice
+        Fault("positions", f"two positions have the number {number}; allowed: each once")
+        for number in repeated
     ]
 
 
@@ -282,19 +284,19 @@ def _pictured(row: Position) -> str:
     return "reference pictures" if row.references.exists() else ""  # type: ignore[attr-defined]
 
 
-def _faults(row: models.Model, place: str, what: str) -> list[Fault]:
+def _faults(row: models.Model, place: str, label: str) -> list[Fault]:
     try:
         row.full_clean()
     except Invalid as invalid:
         return [
-            Fault(f"{place}{field}", ": ".join(filter(None, (what, _name(row, field), " ".join(messages)))))
+            Fault(f"{place}{field}", ": ".join(filter(None, (label, _name(row, field), " ".join(messages)))))
             for field, messages in invalid.message_dict.items()
         ]
     return []
 
 
 def _name(row: models.Model, field: str) -> str:
-    names = {one.name: str(one.verbose_name) for one in row._meta.fields}
+    names = {column.name: str(column.verbose_name) for column in row._meta.fields}
     return names.get(field, "scene")
 
 
@@ -306,23 +308,23 @@ def _remarks(scene: Scene, before: Mapping[str, Any] | None, after: Mapping[str,
     """Return remarks on the consequences of the change for existing trials, plans and reference pictures."""
     if before is None or before == after:
         return []
-    said = []
+    remarks = []
     trials = scene.trials.count()
     if trials and any(before[name] != after[name] for name in ("positions", "milestones")):
-        said.append(
+        remarks.append(
             f"{trials} trial{'s' if trials > 1 else ''} made before keep the old positions and milestones in their "
             "scores: where trials are to be compared, make another scene instead."
         )
     plans = running_plans(scene)
     frozen = set(after) - {"active", "failure_required", "positions"}
     if plans and any(before[name] != after[name] for name in frozen):
-        said.append(f"This stops {', '.join(plans)} until it is changed back, or the plan is amended.")
+        remarks.append(f"This stops {', '.join(plans)} until it is changed back, or the plan is amended.")
     moved = {row["id"]: row for row in before["positions"]}
     stale = [
         row for row in after["positions"] if row["id"] in moved and moved[row["id"]]["bench"] != row["bench"]
     ]
     pictured = scene.positions.filter(pk__in=[row["id"] for row in stale], references__isnull=False)
-    return said + [
+    return remarks + [
         f"Position {row.number} has reference pictures of how it was: take them anew."
         for row in pictured.distinct()
     ]

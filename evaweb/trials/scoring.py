@@ -109,39 +109,39 @@ def score_outcome(
 
 def reached_in_truth(truth: Mapping[str, Any], milestone: Milestone) -> bool | None:
     """Return whether the ground truth reports the milestone as reached in time; None if it does not report on it."""
-    known = truth.get("milestones", {}).get(milestone.truth)
+    reached = truth.get("milestones", {}).get(milestone.truth)
     at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
     late = at is not None and limit is not None and at > limit
-    return None if known is None else bool(known) and not late
+    return None if reached is None else bool(reached) and not late
 
 
 def _answers(milestones: Sequence[Milestone], ticks: Mapping[object, object]) -> dict[int, bool]:
-    known = {milestone.pk: milestone.text for milestone in milestones}
-    names = ", ".join(f"{pk} ({words})" for pk, words in known.items()) or "none, the scene has no milestones"
-    by_name = {str(pk): pk for pk in known}
-    found: dict[int, bool] = {}
+    texts = {milestone.pk: milestone.text for milestone in milestones}
+    names = ", ".join(f"{pk} ({text})" for pk, text in texts.items()) or "none, the scene has no milestones"
+    by_name = {str(pk): pk for pk in texts}
+    answers: dict[int, bool] = {}
     for key, value in ticks.items():
         pk = by_name.get(str(key))
         if pk is None:
             raise EvaError(_MILESTONE_NOT_ONE_THIS_SCENE(key=key, names=names))
         if not isinstance(value, bool):
             raise EvaError(_MILESTONE_ALLOWED_TRUE_FALSE(key=key, value=value))
-        found[pk] = value
-    missing = [str(pk) for pk in known if pk not in found]
+        answers[pk] = value
+    missing = [str(pk) for pk in texts if pk not in answers]
     if missing:
         raise EvaError(_MILESTONE_NOT_ANSWERED_SAY_TRUE(missing=", ".join(missing), names=names))
-    return found
+    return answers
 
 
 def _times(
-    milestones: Sequence[Milestone], answers: Mapping[int, bool], given: Mapping[object, object]
+    milestones: Sequence[Milestone], answers: Mapping[int, bool], times: Mapping[object, object]
 ) -> dict[int, float]:
-    known = {str(milestone.pk): milestone for milestone in milestones}
-    found: dict[int, float] = {}
-    for key, at in given.items():
-        milestone = known.get(str(key))
+    by_key = {str(milestone.pk): milestone for milestone in milestones}
+    seconds: dict[int, float] = {}
+    for key, at in times.items():
+        milestone = by_key.get(str(key))
         if milestone is None:
-            raise EvaError(_TIMES_MILESTONE_NOT_ONE_THIS(key=key, known=", ".join(known)))
+            raise EvaError(_TIMES_MILESTONE_NOT_ONE_THIS(key=key, known=", ".join(by_key)))
         if at is None:
             continue
         if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < LONGEST_RUN_S:
@@ -151,22 +151,22 @@ def _times(
         limit = milestone.time_limit_s
         if limit is not None and at > limit:
             raise EvaError(_REACHED_AFTER_S_COUNTS_WITHIN(text=milestone.text, at=at, limit=limit))
-        found[milestone.pk] = float(at)
-    return found
+        seconds[milestone.pk] = float(at)
+    return seconds
 
 
 def _require_order(reached: Sequence[tuple[Milestone, bool, float | None]]) -> None:
     missed, last = "", 0.0
-    for milestone, done, at in reached:
-        if done and missed:
+    for milestone, is_reached, at in reached:
+        if is_reached and missed:
             raise EvaError(_TICKED_BEFORE_NOT_MILESTONES_THIS(text=milestone.text, missed=missed))
-        if done and at is not None and at < last:
+        if is_reached and at is not None and at < last:
             raise EvaError(_REACHED_AFTER_S_BEFORE_ONE(text=milestone.text, at=at))
-        missed, last = missed or ("" if done else milestone.text), at if at is not None else last
+        missed, last = missed or ("" if is_reached else milestone.text), at if at is not None else last
 
 
 def _implied_success(reached: Sequence[tuple[Milestone, bool, float | None]]) -> bool | None:
-    required = [done for milestone, done, _ in reached if milestone.required]
+    required = [is_reached for milestone, is_reached, _ in reached if milestone.required]
     return all(required) if required else None
 
 
@@ -174,4 +174,4 @@ def _share(reached: Sequence[tuple[Milestone, bool, float | None]], success: boo
     total = sum(milestone.points for milestone, _, _ in reached)
     if not total:
         return float(success)
-    return sum(milestone.points for milestone, done, _ in reached if done) / total
+    return sum(milestone.points for milestone, is_reached, _ in reached if is_reached) / total

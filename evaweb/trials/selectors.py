@@ -78,21 +78,21 @@ def evaluation_get(*, name: str | int) -> Evaluation:
 
 def position_get(*, scene: Scene, number: int) -> Position:
     """Return the position of that number. Raises: NotFound, which lists those of the scene."""
-    found = scene.positions.filter(number=number).first()
-    if found is None:
-        known = ", ".join(map(str, scene.positions.values_list("number", flat=True))) or "none yet"
-        raise NotFound(_POSITION_SCENE_DOES_NOT_EXIST(number=number, name=scene.name, known=known))
-    return found
+    row = scene.positions.filter(number=number).first()
+    if row is None:
+        numbers = ", ".join(map(str, scene.positions.values_list("number", flat=True))) or "none yet"
+        raise NotFound(_POSITION_SCENE_DOES_NOT_EXIST(number=number, name=scene.name, known=numbers))
+    return row
 
 
 def _by_name(rows: QuerySet[_Named], kind: str, name: str | int) -> _Named:
-    found = rows.filter(name=str(name)).first()
-    if found is None and re.fullmatch(r"[0-9]{1,18}", str(name)):
-        found = rows.filter(pk=int(name)).first()
-    if found is None:
-        known = ", ".join(dict.fromkeys(rows.values_list("name", flat=True))) or "none yet"
-        raise NotFound(_DOES_NOT_EXIST_THERE(kind=kind, name=str(name), known=known))
-    return found
+    row = rows.filter(name=str(name)).first()
+    if row is None and re.fullmatch(r"[0-9]{1,18}", str(name)):
+        row = rows.filter(pk=int(name)).first()
+    if row is None:
+        names = ", ".join(dict.fromkeys(rows.values_list("name", flat=True))) or "none yet"
+        raise NotFound(_DOES_NOT_EXIST_THERE(kind=kind, name=str(name), known=names))
+    return row
 
 
 # --- lists -------------------------------------------------------------------------------------------------
@@ -122,11 +122,11 @@ def checkpoint_list(
     return rows if all_of_them else rows.filter(active=True)
 
 
-def _checkpoints(sight: Visibility) -> QuerySet[Checkpoint]:
+def _checkpoints(visibility: Visibility) -> QuerySet[Checkpoint]:
     """Return the visible checkpoints, each without a hidden parent."""
-    rows: QuerySet[Checkpoint] = sight.filter_visible(Checkpoint.objects.all(), "pk")
+    rows: QuerySet[Checkpoint] = visibility.filter_visible(Checkpoint.objects.all(), "pk")
     return rows.prefetch_related(
-        Prefetch("parent", queryset=sight.filter_visible(Checkpoint.objects.all(), "pk"))
+        Prefetch("parent", queryset=visibility.filter_visible(Checkpoint.objects.all(), "pk"))
     )
 
 
@@ -145,17 +145,17 @@ def trial_get(*, id: int) -> Trial:
     """Return the trial with its related rows. Raises: NotFound."""
     scores = Score.objects.select_related("rater").prefetch_related("outcomes").order_by("-pk")
     rows = Trial.objects.select_related(*_NAMED, "episode", "voided_by")
-    asked = VoidRequest.objects.select_related("by", "answered_by")
-    found = (
-        rows.prefetch_related(Prefetch("scores", scores), Prefetch("void_requests", asked))
+    requests = VoidRequest.objects.select_related("by", "answered_by")
+    trial = (
+        rows.prefetch_related(Prefetch("scores", scores), Prefetch("void_requests", requests))
         .filter(pk=id)
         .first()
         if 0 < id < 2**63
         else None
     )
-    if found is None:
+    if trial is None:
         raise NotFound(_TRIAL_DOES_NOT_EXIST(identity=id))
-    return found
+    return trial
 
 
 # `handout` is a reverse relation defined by evaweb.plans.
@@ -223,10 +223,10 @@ def attempts_of(*, trial: Trial) -> QuerySet[Trial]:
 def commands_of(*, trial: Trial) -> QuerySet[Command]:
     """Return the commands sent to the trial's station between its preparation and its end, oldest first."""
     until = trial.ended_at or (None if trial.status in UNFINISHED else trial.changed_at)
-    asked = Command.objects.filter(station=trial.station, issued_at__gte=trial.prepared_at)
-    asked = asked.filter(issued_at__lte=until) if until else asked
+    commands = Command.objects.filter(station=trial.station, issued_at__gte=trial.prepared_at)
+    commands = commands.filter(issued_at__lte=until) if until else commands
     mine = Q(pk__in=[key for key in (trial.setup, trial.run) if key])
-    return (asked | Command.objects.filter(mine)).select_related("user").order_by("issued_at").distinct()
+    return (commands | Command.objects.filter(mine)).select_related("user").order_by("issued_at").distinct()
 
 
 # --- statistics --------------------------------------------------------------------------------------------
@@ -254,8 +254,8 @@ def statistics(
     which = filters or TrialFilters()
     trials = which.apply(sight.filter_visible(Trial.objects.order_by()), sight)
     cells = _cells(trials)
-    others = _other_counts(trials)
-    keys = {*cells, *others}
+    other_counts = _other_counts(trials)
+    keys = {*cells, *other_counts}
     scenes = Scene.objects.in_bulk({scene for scene, _ in keys})
     checkpoints = Checkpoint.objects.in_bulk({checkpoint for _, checkpoint in keys})
     rows = [
@@ -263,9 +263,9 @@ def statistics(
             scenes[scene],
             checkpoints[checkpoint],
             cells.get((scene, checkpoint)) or _summary([]),
-            others[scene, checkpoint][TrialStatus.ENDED],
-            others[scene, checkpoint][TrialStatus.INTERRUPTED],
-            others[scene, checkpoint][TrialStatus.VOIDED],
+            other_counts[scene, checkpoint][TrialStatus.ENDED],
+            other_counts[scene, checkpoint][TrialStatus.INTERRUPTED],
+            other_counts[scene, checkpoint][TrialStatus.VOIDED],
         )
         for scene, checkpoint in keys
     ]
@@ -309,26 +309,33 @@ def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
     rows = Trial.objects.order_by("-changed_at", "-pk")
     named = rows.values_list("pk", "changed_at", "scene_id", "checkpoint_id")
     # Read before the cells, so that concurrent changes are found the next time.
-    seen = list((named if since is None else named.filter(changed_at__gte=since))[: _MOST_CHANGED + 1])
-    newest = seen[0][1] if seen else None
-    recent = frozenset(row for row in seen if newest and row[1] >= newest - _LATE)
-    if before is None or since is None or len(seen) > _MOST_CHANGED or not _same(before.recent, seen):
+    changed_rows = list(
+        (named if since is None else named.filter(changed_at__gte=since))[: _MOST_CHANGED + 1]
+    )
+    newest = changed_rows[0][1] if changed_rows else None
+    recent = frozenset(row for row in changed_rows if newest and row[1] >= newest - _LATE)
+    if (
+        before is None
+        or since is None
+        or len(changed_rows) > _MOST_CHANGED
+        or not _same(before.recent, changed_rows)
+    ):
         cells = _summarised(trials)
     else:
-        changed = {(scene, checkpoint) for _, _, scene, checkpoint in set(seen) - before.recent}
-        cells = {cell: kept for cell, kept in before.cells.items() if cell not in changed}
+        changed = {(scene, checkpoint) for _, _, scene, checkpoint in set(changed_rows) - before.recent}
+        cells = {cell: summary for cell, summary in before.cells.items() if cell not in changed}
         for scene, checkpoint in changed:
             cells |= _summarised(trials.filter(scene=scene, checkpoint=checkpoint))
     return _Known(cells, newest, recent)
 
 
-def _same(before: Collection[_Row], seen: Collection[_Row]) -> bool:
+def _same(before: Collection[_Row], rows: Collection[_Row]) -> bool:
     """Return True if all trials in `before` are still in `seen`, with the same scene and checkpoint.
 
     Otherwise the database was lost or its clock was set back.
     """
     return {(pk, scene, checkpoint) for pk, _, scene, checkpoint in before} <= {
-        (pk, scene, checkpoint) for pk, _, scene, checkpoint in seen
+        (pk, scene, checkpoint) for pk, _, scene, checkpoint in rows
     }
 
 
@@ -347,11 +354,11 @@ def _scored_cells(trials: QuerySet[Trial]) -> dict[_Cell, list[_Outcome]]:
 
 def _other_counts(trials: QuerySet[Trial]) -> dict[_Cell, dict[str, int]]:
     counted = (TrialStatus.ENDED, TrialStatus.INTERRUPTED, TrialStatus.VOIDED)
-    found: dict[_Cell, dict[str, int]] = defaultdict(lambda: dict.fromkeys(counted, 0))
+    counts: dict[_Cell, dict[str, int]] = defaultdict(lambda: dict.fromkeys(counted, 0))
     grouped = trials.filter(status__in=counted).values("scene_id", "checkpoint_id", "status")
     for row in grouped.annotate(n=Count("pk")):
-        found[row["scene_id"], row["checkpoint_id"]][row["status"]] = row["n"]
-    return found
+        counts[row["scene_id"], row["checkpoint_id"]][row["status"]] = row["n"]
+    return counts
 
 
 def _summary(outcomes: Sequence[_Outcome]) -> Summary:
@@ -366,24 +373,24 @@ def _summary(outcomes: Sequence[_Outcome]) -> Summary:
 # --- parsing -----------------------------------------------------------------------------------------------
 
 
-def _status(given: str) -> str:
-    if given not in TrialStatus.values:
-        raise EvaError(_STATUS_ALLOWED(given=given, values=", ".join(TrialStatus.values)))
-    return given
+def _status(text: str) -> str:
+    if text not in TrialStatus.values:
+        raise EvaError(_STATUS_ALLOWED(given=text, values=", ".join(TrialStatus.values)))
+    return text
 
 
-def _since(given: str) -> datetime:
+def _since(text: str) -> datetime:
     try:
-        moment = parse_datetime(given)
-        day = parse_date(given) if moment is None else None
+        moment = parse_datetime(text)
+        day = parse_date(text) if moment is None else None
     except ValueError:  # well-formed, but not a valid date
         moment = day = None
     if day is not None:
         moment = datetime.combine(day, time.min)
     if moment is None:
-        raise EvaError(_SINCE_ALLOWED_DAY_SUCH_AS(given=given))
+        raise EvaError(_SINCE_ALLOWED_DAY_SUCH_AS(given=text))
     try:
         moment = moment if timezone.is_aware(moment) else timezone.make_aware(moment)
         return moment.astimezone(UTC)
     except OverflowError:  # at the end of the calendar, where conversion between zones overflows
-        raise EvaError(_SINCE_THERE_NO_SUCH_TIME(given=given)) from None
+        raise EvaError(_SINCE_THERE_NO_SUCH_TIME(given=text)) from None

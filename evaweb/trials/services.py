@@ -162,7 +162,7 @@ def declare_failing(rule: Callable[[Trial], str]) -> None:
 
 def failing(trial: Trial) -> str:
     """Return the reason for which the trial is a failure by itself; "" if its milestones decide."""
-    return next((why for rule in _failing if (why := rule(trial))), "")
+    return next((reason for rule in _failing if (reason := rule(trial))), "")
 
 
 def run_checks(what: str, trial: Trial, user: Any) -> None:
@@ -202,10 +202,10 @@ def prepare_trial(
 def open_bench(station: Station) -> Evaluation:
     """Return the evaluation of the station's trials outside any plan; create it if needed."""
     name = f"open bench {station.name}"
-    found, _ = Evaluation.objects.get_or_create(
+    bench, _ = Evaluation.objects.get_or_create(
         station=station, kind=Evaluation.Kind.OPEN_BENCH, defaults={"name": name}
     )
-    return found
+    return bench
 
 
 def _check_choice(
@@ -214,8 +214,8 @@ def _check_choice(
     named = (("station", station.name, station), ("scene", scene.name, scene))
     for kind, name, chosen in (*named, ("checkpoint", checkpoint.name, checkpoint)):
         if not chosen.active:
-            why = f" ({station.message})" if chosen is station and station.message else ""
-            raise Conflict(_SWITCHED_OFF(kind=kind, name=name, why=why))
+            message = f" ({station.message})" if chosen is station and station.message else ""
+            raise Conflict(_SWITCHED_OFF(kind=kind, name=name, why=message))
     if position.scene_id != scene.pk:
         raise NotFound(_POSITION_OF_ANOTHER_SCENE(position=position.pk, name=scene.name))
     if seed is not None and not 0 <= seed <= HIGHEST_SEED:
@@ -356,49 +356,55 @@ def score_trial(
     require_role(user, Role.OPERATOR)
     if source not in Score.Source.values:
         raise EvaError(_SOURCE(source=source, values=", ".join(Score.Source.values)))
-    words = {
+    texts = {
         "note": clean_text("note", note, LONGEST_NOTE),
         **failures.clean_failure(failure_phase=failure_phase, failure=failure),
         "reason": clean_text("reason", reason, LONGEST_NOTE),
     }
     with transaction.atomic():
         run_checks("scored", trial, user)
-        held = lock_trial(trial)
-        run_checks("judged", held, user)
-        rows = list(held.scene.milestones.order_by("order"))
-        when = _times_before(held, rows, milestones) if times is None else times
-        fails = bool(failing(held))
+        locked = lock_trial(trial)
+        run_checks("judged", locked, user)
+        rows = list(locked.scene.milestones.order_by("order"))
+        when = _times_before(locked, rows, milestones) if times is None else times
+        fails = bool(failing(locked))
         judged = partial(
-            score_outcome, rows, milestones, success, times=when, ordered=held.scene.ordered, fails=fails
+            score_outcome, rows, milestones, success, times=when, ordered=locked.scene.ordered, fails=fails
         )
-        said = {"rater": user, "source": source, **words}
-        first = held.verdict if uuid is None else Score.objects.filter(uuid=parse_command_uuid(uuid)).first()
-        if first is not None and first.trial == held and _is_same_score(first, said, judged()):
+        values = {"rater": user, "source": source, **texts}
+        first = (
+            locked.verdict if uuid is None else Score.objects.filter(uuid=parse_command_uuid(uuid)).first()
+        )
+        if first is not None and first.trial == locked and _is_same_score(first, values, judged()):
             return first
         if first is not None and uuid is not None:
             raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
-        require_scorable(held, words["reason"])
-        found = judged()
-        run_checks(f"judged {'success' if found.success else 'failure'}", held, user)
+        require_scorable(locked, texts["reason"])
+        outcome = judged()
+        run_checks(f"judged {'success' if outcome.success else 'failure'}", locked, user)
         if uuid is None:
-            _reject_repeat(held, said, found)
+            _reject_repeat(locked, values, outcome)
         if source == Score.Source.TRUTH:
-            _require_truth(held, found)
+            _require_truth(locked, outcome)
         failures.check_failure(
-            held.scene,
-            words,
-            success=found.success,
+            locked.scene,
+            texts,
+            success=outcome.success,
             by_person=source == Score.Source.HUMAN,
-            said=failures.score_failure(held.verdict),
+            said=failures.score_failure(locked.verdict),
         )
-        if held.status == TrialStatus.SCORED and _judges_alike(held.verdict, found):
-            run_checks("reworded", held, user)
-        elif held.verdict is not None:
-            require_own(held, user)
+        if locked.status == TrialStatus.SCORED and _judges_alike(locked.verdict, outcome):
+            run_checks("reworded", locked, user)
+        elif locked.verdict is not None:
+            require_own(locked, user)
         score = Score(
-            uuid=parse_command_uuid(uuid), trial=held, success=found.success, score=found.score, **said
+            uuid=parse_command_uuid(uuid),
+            trial=locked,
+            success=outcome.success,
+            score=outcome.score,
+            **values,
         )
-        counts_now(held, score, _outcomes(score, found), user)
+        counts_now(locked, score, _outcomes(score, outcome), user)
     trial.refresh_from_db()
     return score
 
@@ -406,17 +412,17 @@ def score_trial(
 def abandon_trial(*, user: User, trial: Trial, reason: str = "") -> Trial:
     """Abandon a trial that never ran; its number is used again by another attempt."""
     require_role(user, Role.OPERATOR)
-    why = clean_text("reason", reason, LONGEST_NOTE) or "abandoned"
+    text = clean_text("reason", reason, LONGEST_NOTE) or "abandoned"
     with transaction.atomic():
-        held = lock_trial(trial)
-        why = f"{why} ({user.get_username()})"
-        if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
-            return held  # repeated request whose answer was lost
-        require_own(held, user)
-        lifecycle.apply(held, Transition.ABANDON)
-        held.reason = why
-        held.save()
-        notify_settled(held, user)
+        locked = lock_trial(trial)
+        text = f"{text} ({user.get_username()})"
+        if (locked.status, locked.reason) == (TrialStatus.ABANDONED, text):
+            return locked  # repeated request whose answer was lost
+        require_own(locked, user)
+        lifecycle.apply(locked, Transition.ABANDON)
+        locked.reason = text
+        locked.save()
+        notify_settled(locked, user)
     trial.refresh_from_db()
     return trial
 
@@ -429,8 +435,8 @@ def request_publication(trial: Trial) -> None:
 
 def notify_settled(trial: Trial, user: Any) -> None:
     """Call the functions registered by `register_settled`."""
-    for told in _settled:
-        told(trial, user)
+    for on_settled in _settled:
+        on_settled(trial, user)
 
 
 def lock_trial(trial: Trial) -> Trial:
@@ -438,20 +444,20 @@ def lock_trial(trial: Trial) -> Trial:
     return Trial.objects.select_for_update().get(pk=trial.pk)
 
 
-def _reject_repeat(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
+def _reject_repeat(trial: Trial, values: Mapping[str, Any], outcome: ScoredOutcome) -> None:
     """Raise Conflict if this equals an earlier score of the rater: it may be a late copy of a score that was
     corrected.
     """
-    before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
-    if any(_is_same_score(score, said, found) for score in before):
+    before = trial.scores.filter(rater=values["rater"]).prefetch_related("outcomes")
+    if any(_is_same_score(score, values, outcome) for score in before):
         raise Conflict(_SAID_BEFORE(trial=trial.pk))
 
 
-def _require_truth(trial: Trial, found: ScoredOutcome) -> None:
+def _require_truth(trial: Trial, outcome: ScoredOutcome) -> None:
     """Raise EvaError unless the bench's ground truth agrees with the score, which is recorded as given by the bench."""
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
-    for milestone, reached, _ in found.reached:
+    for milestone, reached, _ in outcome.reached:
         truth = bool(reached_in_truth(trial.truth, milestone))
         if reached != truth:
             raise EvaError(
@@ -459,20 +465,20 @@ def _require_truth(trial: Trial, found: ScoredOutcome) -> None:
             )
 
 
-def _is_same_score(score: Score, said: Mapping[str, Any], found: ScoredOutcome) -> bool:
+def _is_same_score(score: Score, values: Mapping[str, Any], scored: ScoredOutcome) -> bool:
     """Return True if the score equals the given one."""
     outcomes = {outcome.milestone_id: (outcome.reached, outcome.at_s) for outcome in score.outcomes.all()}
-    same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in found.reached}
-    words = all(getattr(score, name) == value for name, value in said.items())
-    return same and words and score.success == found.success
+    same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in scored.reached}
+    same_values = all(getattr(score, name) == value for name, value in values.items())
+    return same and same_values and score.success == scored.success
 
 
-def _judges_alike(score: Score | None, found: ScoredOutcome) -> bool:
+def _judges_alike(score: Score | None, outcome: ScoredOutcome) -> bool:
     """Return True if the score has the same milestones and success, so that only texts differ."""
-    if score is None or score.success != found.success:
+    if score is None or score.success != outcome.success:
         return False
-    said = dict(score.outcomes.values_list("milestone_id", "reached"))
-    return said == {milestone.pk: reached for milestone, reached, _ in found.reached}
+    reached_before = dict(score.outcomes.values_list("milestone_id", "reached"))
+    return reached_before == {milestone.pk: reached for milestone, reached, _ in outcome.reached}
 
 
 def _times_before(
@@ -480,13 +486,15 @@ def _times_before(
 ) -> dict[object, float]:
     """Return the times of the current score for milestones still ticked; {} if the scene now forbids them."""
     outcomes = trial.verdict.outcomes.exclude(at_s=None) if trial.verdict else ()
-    known = {outcome.milestone_id: outcome.at_s for outcome in outcomes if outcome.reached}
+    seconds = {outcome.milestone_id: outcome.at_s for outcome in outcomes if outcome.reached}
     ticked = {str(key) for key, reached in ticks.items() if reached is True}
-    kept = [(row, known[row.pk]) for row in milestones if row.pk in known and str(row.pk) in ticked]
-    late = any(row.time_limit_s is not None and at > row.time_limit_s for row, at in kept)
-    times = [at for _, at in kept]
+    retained = [(row, seconds[row.pk]) for row in milestones if row.pk in seconds and str(row.pk) in ticked]
+    late = any(row.time_limit_s is not None and at > row.time_limit_s for row, at in retained)
+    times = [at for _, at in retained]
     return (
-        {} if late or (trial.scene.ordered and sorted(times) != times) else {row.pk: at for row, at in kept}
+        {}
+        if late or (trial.scene.ordered and sorted(times) != times)
+        else {row.pk: at for row, at in retained}
     )
 
 
@@ -497,9 +505,9 @@ def require_scorable(trial: Trial, reason: str) -> None:
         raise EvaError(_SCORED_ALREADY(trial=trial.pk))
     if trial.status == TrialStatus.INTERRUPTED and _repeated(trial):
         raise Conflict(_REPEATED_SINCE(trial=trial.pk))
-    other = attempts_of(trial=trial).filter(status=TrialStatus.SCORED).exclude(pk=trial.pk).first()
-    if other is not None:  # e.g. this trial was abandoned, but its run turns out to have been accepted
-        raise Conflict(_ANOTHER_COUNTS(other=other.pk, trial=trial.pk))
+    counting = attempts_of(trial=trial).filter(status=TrialStatus.SCORED).exclude(pk=trial.pk).first()
+    if counting is not None:  # e.g. this trial was abandoned, but its run turns out to have been accepted
+        raise Conflict(_ANOTHER_COUNTS(other=counting.pk, trial=trial.pk))
     unrecorded = "" if trial.status == TrialStatus.SCORED else why_unrecorded(episode=trial.episode)
     if unrecorded:
         raise Conflict(_NEVER_RAN(trial=trial.pk, unrecorded=unrecorded))
@@ -520,7 +528,7 @@ def _repeated(trial: Trial) -> bool:
     return bool(newest > trial.attempt)
 
 
-def _outcomes(score: Score, found: ScoredOutcome) -> list[MilestoneOutcome]:
+def _outcomes(score: Score, outcome: ScoredOutcome) -> list[MilestoneOutcome]:
     return [
         MilestoneOutcome(
             score=score,
@@ -532,7 +540,7 @@ def _outcomes(score: Score, found: ScoredOutcome) -> list[MilestoneOutcome]:
             reached=reached,
             at_s=at,
         )
-        for milestone, reached, at in found.reached
+        for milestone, reached, at in outcome.reached
     ]
 
 
@@ -550,7 +558,7 @@ def counts_now(trial: Trial, score: Score, outcomes: Sequence[MilestoneOutcome],
 
 
 def require_reason(reason: str, when: str) -> str:
-    why = clean_text("reason", reason, LONGEST_NOTE)
-    if not why:
+    text = clean_text("reason", reason, LONGEST_NOTE)
+    if not text:
         raise EvaError(_NO_REASON(when=when))
-    return why
+    return text

@@ -86,7 +86,7 @@ def trial_command(
     """
     require_role(user, Role.OPERATOR)
     identity = parse_command_uuid(uuid)
-    given = {
+    request = {
         "user": user,
         "station": trial.station,
         "kind": kind,
@@ -97,10 +97,10 @@ def trial_command(
         "uuid": identity,
     }
     if kind == "setup":
-        return _set_up(trial, given)
+        return _set_up(trial, request)
     if kind == "run":
-        return _run(trial, given)
-    return issue_command(**given, args=dict(args or {}))
+        return _run(trial, request)
+    return issue_command(**request, args=dict(args or {}))
 
 
 def checkpoint_command(
@@ -144,7 +144,7 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     args: dict[str, Any] = {"task": trial.instruction, **_policy_args(trial.checkpoint)}
     if trial.strategy is not None:
         args["strategy"] = trial.strategy
-    for least in (found for find in _least if (found := find(trial))):
+    for least in (table for find in _least if (table := find(trial))):
         args["least"] = dict(least)
     if trial.station.simulated and trial.seed is not None:
         laid = simulated_bench(trial.position.bench)
@@ -164,11 +164,11 @@ def run_args(trial: Trial, user: User) -> dict[str, Any]:
     return args
 
 
-def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
-    first = Command.objects.filter(pk=given["uuid"]).first()
+def _set_up(trial: Trial, request: Mapping[str, Any]) -> Command:
+    first = Command.objects.filter(pk=request["uuid"]).first()
     if first is None:
-        _require_prepared(trial, "set up", given["user"])
-    args = setup_args(trial, given["uuid"])
+        _require_prepared(trial, "set up", request["user"])
+    args = setup_args(trial, request["uuid"])
     if first is not None:
         _require_same(
             first,
@@ -176,13 +176,13 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
             trial.setup == first.pk or _setup_identity(first.args) == _setup_identity(to_json_value(args)),
         )
         args = first.args
-    row = issue_command(**given, args=args, vouched=TABLES)
+    row = issue_command(**request, args=args, vouched=TABLES)
     if row.status not in NOT_CARRIED_OUT:
         with transaction.atomic():
-            held = _lock_trial(trial)
-            if held.status == TrialStatus.PREPARED:
-                held.setup = row.pk
-                held.save()
+            locked = _lock_trial(trial)
+            if locked.status == TrialStatus.PREPARED:
+                locked.setup = row.pk
+                locked.save()
     trial.refresh_from_db()
     return row
 
@@ -192,18 +192,18 @@ def _setup_identity(args: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in args.items() if key != "least"}
 
 
-def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
-    first = Command.objects.filter(pk=given["uuid"]).first()
+def _run(trial: Trial, request: Mapping[str, Any]) -> Command:
+    first = Command.objects.filter(pk=request["uuid"]).first()
     if first is None:
-        _require_prepared(trial, "run", given["user"])
+        _require_prepared(trial, "run", request["user"])
         _require_set_up(trial)
-        took = _require_loaded(trial, given["user"])
+        took = _require_loaded(trial, request["user"])
         Trial.objects.filter(pk=trial.pk).update(setup_took=took)
-        run_checks("run", trial, given["user"])
+        run_checks("run", trial, request["user"])
     else:
         _require_same(first, trial, _is_about(first, trial))
-    args = first.args if first else run_args(trial, given["user"])
-    row = issue_command(**given, args=args)
+    args = first.args if first else run_args(trial, request["user"])
+    row = issue_command(**request, args=args)
     if row.status in CARRIED_OUT:
         with transaction.atomic():
             begin_run(_lock_trial(trial), command=row, episode=_episode_of(row))
@@ -211,11 +211,13 @@ def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
     return row
 
 
-def _require_prepared(trial: Trial, what: str, user: User) -> None:
+def _require_prepared(trial: Trial, action: str, user: User) -> None:
     status = TrialStatus(_held_status(trial))
     if status is not TrialStatus.PREPARED:
         raise Conflict(
-            _NOT_IN_THIS_STATE(trial=trial.pk, label=status.label, what=what, advice=lifecycle.advice(status))
+            _NOT_IN_THIS_STATE(
+                trial=trial.pk, label=status.label, what=action, advice=lifecycle.advice(status)
+            )
         )
     run_checks("prepared", trial, user)
     if not trial.checkpoint.active:
@@ -241,13 +243,17 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
     Returns: Durations of the policy's set-up stages [s], None if unknown.
     """
     status = connection_to(trial.station.name).status()
-    told = status.get("checkpoint") or {}
-    if told.get("id") != trial.checkpoint_id:
-        seen = visibility_for_user(user)
-        other = "another checkpoint" if told.get("id") in seen.checkpoints else told.get("name")
+    loaded = status.get("checkpoint") or {}
+    if loaded.get("id") != trial.checkpoint_id:
+        visibility = visibility_for_user(user)
+        loaded_name = (
+            "another checkpoint" if loaded.get("id") in visibility.checkpoints else loaded.get("name")
+        )
         raise Conflict(
             _SET_UP_BY_SOMEONE(
-                name=trial.station.name, other=other or "no checkpoint", label=seen.checkpoint_label(trial)
+                name=trial.station.name,
+                other=loaded_name or "no checkpoint",
+                label=visibility.checkpoint_label(trial),
             )
         )
     took = status.get("setup_took")

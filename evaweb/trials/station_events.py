@@ -70,10 +70,10 @@ def begin_run(trial: Trial, *, command: Command, episode: UUID | None) -> None:
 
 
 def _may_begin(trial: Trial) -> bool:
-    others = Trial.objects.filter(station=trial.station, status__in=lifecycle.OPEN_STATES).exclude(
+    open_trials = Trial.objects.filter(station=trial.station, status__in=lifecycle.OPEN_STATES).exclude(
         pk=trial.pk
     )
-    if lifecycle.allows(trial, Transition.RUN) and not others.exists():
+    if lifecycle.allows(trial, Transition.RUN) and not open_trials.exists():
         return True
     log.error("trial %s is %s, but %s accepted its run", trial.pk, trial.status, trial.station.name)
     return False
@@ -113,8 +113,8 @@ def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | Non
     if after is None or not after.going or (before is not None and before.going):
         return None
     command = Command.objects.filter(pk=_uuid(data.get("uuid")), station=station, kind="run").first()
-    asked = (command.args.get("trial") or {}) if command else {}
-    trial = _lock_latest(uuid=_uuid(asked.get("uuid")), station=station) if asked else None
+    request = (command.args.get("trial") or {}) if command else {}
+    trial = _lock_latest(uuid=_uuid(request.get("uuid")), station=station) if request else None
     if command is None or trial is None or trial.run_event is not None:
         return None
     begin_run(trial, command=command, episode=_uuid(command.data.get("episode")))
@@ -250,9 +250,9 @@ def _lock_latest(**key: Any) -> Trial | None:
     return Trial.objects.select_for_update().filter(**key).order_by("-pk").first()
 
 
-def _uuid(given: object) -> UUID | None:
+def _uuid(text: object) -> UUID | None:
     try:
-        return UUID(str(given))
+        return UUID(str(text))
     except ValueError:
         return None
 

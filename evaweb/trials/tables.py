@@ -33,21 +33,21 @@ def check_strategy(given: object) -> None:
         _check_kinds(given, _strategies(), '{"kind": "rtc", "inference_rate": 5}')
 
 
-def _check_kinds(given: object, kinds: Mapping[str, type[pydantic.BaseModel]], example: str) -> None:
-    if not isinstance(given, Mapping):
-        raise ValidationError(_sentence(given, f"a table such as {example}"))
-    wanted = given.get("kind")
-    if wanted is not None and not (isinstance(wanted, str) and wanted in kinds):
-        raise ValidationError(f"kind = {wanted!r}; allowed: {', '.join(kinds)}")
-    problems = {kind: _problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)}
+def _check_kinds(value: object, kinds: Mapping[str, type[pydantic.BaseModel]], example: str) -> None:
+    if not isinstance(value, Mapping):
+        raise ValidationError(_sentence(value, f"a table such as {example}"))
+    requested = value.get("kind")
+    if requested is not None and not (isinstance(requested, str) and requested in kinds):
+        raise ValidationError(f"kind = {requested!r}; allowed: {', '.join(kinds)}")
+    problems = {kind: _problems(value, kinds[kind]) for kind in ([requested] if requested else kinds)}
     if all(problems.values()):
-        raise ValidationError(problems[max(problems, key=lambda kind: _matching_keys(given, kinds[kind]))])
+        raise ValidationError(problems[max(problems, key=lambda kind: _matching_keys(value, kinds[kind]))])
 
 
 def check_tags(given: object) -> None:
     """Raise ValidationError unless `given` is a list of distinct short words."""
-    words = isinstance(given, list) and all(isinstance(tag, str) and _TAG.fullmatch(tag) for tag in given)
-    if not words:
+    is_valid = isinstance(given, list) and all(isinstance(tag, str) and _TAG.fullmatch(tag) for tag in given)
+    if not is_valid:
         raise ValidationError(_sentence(given, "words of at most 40 letters a to z, digits and ._:/+-"))
     if len(set(given)) < len(given):  # type: ignore[arg-type, call-overload]
         raise ValidationError(_sentence(given, "each tag once"))
@@ -66,10 +66,10 @@ def check_term(given: str) -> None:
 
 def check_milestones(texts: Sequence[str]) -> None:
     """Raise ValidationError if two milestones of a scene have the same text: results could not distinguish them."""
-    twice = next((text for text in texts if texts.count(text) > 1), None)
-    if twice is not None:
+    repeated = next((text for text in texts if texts.count(text) > 1), None)
+    if repeated is not None:
         raise ValidationError(
-            f"two milestones are {twice!r:.80}; allowed: different words for each of a scene"
+            f"two milestones are {repeated!r:.80}; allowed: different words for each of a scene"
         )
 
 
@@ -129,26 +129,26 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
-    """Return the errors of `given` as a table of this kind.
+def _problems(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
+    """Return the errors of `value` as a table of this kind.
 
     Missing keys are no errors: they come from the deployment.
     """
     kind = config.model_fields["kind"].default
     try:
-        config.model_validate({**given, "kind": kind})
+        config.model_validate({**value, "kind": kind})
     except pydantic.ValidationError as invalid:
         errors = [error for error in invalid.errors() if error["type"] != "missing"]
         return [_problem(error, config, kind) for error in errors]
     return []
 
 
-def _matching_keys(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
-    """Return how many keys of `given` resemble keys of this kind of table, and the number of the kind's keys.
+def _matching_keys(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
+    """Return how many keys of `value` resemble keys of this kind of table, and the number of the kind's keys.
 
     The second number breaks ties.
     """
-    near = [key for key in given if get_close_matches(str(key), config.model_fields, n=1)]
+    near = [key for key in value if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)
 
 
@@ -162,9 +162,9 @@ def _problem(error: Any, config: type[pydantic.BaseModel], kind: str) -> str:
     return f"{key} = {error['input']!r:.80}: {error['msg'].removeprefix('Value error, ')}"
 
 
-def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
-    """Return the model of the nested table at the path `way` of keys."""
-    for key in way:
+def _table(config: type[pydantic.BaseModel], path: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
+    """Return the model of the nested table at the `path` of keys."""
+    for key in path:
         field = config.model_fields.get(str(key))
         parts = (field.annotation, *get_args(field.annotation)) if field else ()
         within = [part for part in parts if isinstance(part, type) and issubclass(part, pydantic.BaseModel)]
@@ -183,5 +183,5 @@ def _strategies() -> dict[str, type[pydantic.BaseModel]]:
     return {config.model_fields["kind"].default: config for config in strategy_tables()}
 
 
-def _sentence(given: object, allowed: str, name: str = "") -> str:
-    return f"{name}{' = ' if name else ''}{given!r:.80}; allowed: {allowed}"
+def _sentence(value: object, allowed: str, name: str = "") -> str:
+    return f"{name}{' = ' if name else ''}{value!r:.80}; allowed: {allowed}"

@@ -35,20 +35,20 @@ PER_PAGE = 50
 @require_GET
 def result(request: HttpRequest) -> HttpResponse:
     """Show success per scene and checkpoint, then the trials; filters and order are in the URL."""
-    seen = visibility_for_request(request)
-    listing = Listing(request.GET, _columns(seen), _filters(seen))
+    visibility = visibility_for_request(request)
+    listing = Listing(request.GET, _columns(visibility), _filters(visibility))
     filters = TrialFilters(**listing.chosen)
     try:
-        filters.apply(Trial.objects.all(), seen)
+        filters.apply(Trial.objects.all(), visibility)
     except EvaError as fault:
         listing.refuse(fault)
         filters = TrialFilters()
     rows = selectors.statistics(
-        replace(filters, status=""), seen
+        replace(filters, status=""), visibility
     )  # the status filters only the list of trials
     context = {
         "figures": scene_figures(rows),
-        "page": listing.page(selectors.trial_list(filters, seen), PER_PAGE),
+        "page": listing.page(selectors.trial_list(filters, visibility), PER_PAGE),
         "listing": listing,
     }
     fragment = request.headers.get("HX-Request") and not request.headers.get("HX-History-Restore-Request")
@@ -64,21 +64,21 @@ def trial(request: HttpRequest, id: int) -> HttpResponse:
 @require_POST
 def score(request: HttpRequest, id: int) -> HttpResponse:
     """Score a trial or correct its score; on an error the form keeps the typed values."""
-    found = selectors.trial_get(id=id)
+    row = selectors.trial_get(id=id)
     ticked = set(request.POST.getlist("milestone"))
-    milestones = {key: str(key) in ticked for key in found.scene.milestones.values_list("pk", flat=True)}
-    given = {name: request.POST.get(name, "") for name in ("note", "reason", *failures.FIELDS)}
+    milestones = {key: str(key) in ticked for key in row.scene.milestones.values_list("pk", flat=True)}
+    values = {name: request.POST.get(name, "") for name in ("note", "reason", *failures.FIELDS)}
     try:
         services.score_trial(
             user=request.user,  # type: ignore[arg-type]
-            trial=found,
+            trial=row,
             milestones=milestones,
             success={"yes": True, "no": False}.get(request.POST.get("success", "")),
             uuid=request.POST.get("uuid") or None,
-            **given,
+            **values,
         )
     except EvaError as fault:
-        typed = {**given, "milestones": milestones, "success": request.POST.get("success", "")}
+        typed = {**values, "milestones": milestones, "success": request.POST.get("success", "")}
         return _trial_page(request, id, fault=fault, typed=typed)
     return redirect("result-trial", id=id)
 
@@ -121,34 +121,34 @@ def _truth(trial: Trial) -> list[tuple[str, Any]]:
 def _trial_page(
     request: HttpRequest, id: int, fault: EvaError | None = None, typed: Mapping[str, Any] | None = None
 ) -> HttpResponse:
-    found = selectors.trial_get(id=id)
-    hidden = visibility_for_request(request).hides(found)
+    trial = selectors.trial_get(id=id)
+    hidden = visibility_for_request(request).hides(trial)
     operator = role_of(request.user) is not Role.VIEWER
-    milestones = list(found.scene.milestones.order_by("order"))
-    typed = typed or _as_scored(found)
+    milestones = list(trial.scene.milestones.order_by("order"))
+    typed = typed or _as_scored(trial)
     context = {
-        "trial": found,
-        "episode": found.episode,
-        "stage": playback_stage(episode=found.episode) if found.episode else None,
-        "scores": list(found.scores.all()),
-        "truth": () if hidden and not found.verdict_id else _truth(found),
-        "milestones": [(milestone, _is_checked(found, milestone.pk, typed)) for milestone in milestones],
+        "trial": trial,
+        "episode": trial.episode,
+        "stage": playback_stage(episode=trial.episode) if trial.episode else None,
+        "scores": list(trial.scores.all()),
+        "truth": () if hidden and not trial.verdict_id else _truth(trial),
+        "milestones": [(milestone, _is_checked(trial, milestone.pk, typed)) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
-        "fails": services.failing(found),
-        "may_score": operator and lifecycle.allows(found, Transition.SCORE),
-        "words_alone": _text_only_reason(found, request.user) if found.verdict_id else "",
+        "fails": services.failing(trial),
+        "may_score": operator and lifecycle.allows(trial, Transition.SCORE),
+        "words_alone": _text_only_reason(trial, request.user) if trial.verdict_id else "",
         "may_void": operator
-        and lifecycle.allows(found, Transition.VOID)
-        and found.status != TrialStatus.VOID_ASKED,
-        "by_two": voids.needs_two_people(found),
-        "void_requests": list(found.void_requests.all()),
-        "may_answer": operator and voids.can_answer_void(found, request.user),
-        "attempts": selectors.attempts_of(trial=found),
+        and lifecycle.allows(trial, Transition.VOID)
+        and trial.status != TrialStatus.VOID_ASKED,
+        "by_two": voids.needs_two_people(trial),
+        "void_requests": list(trial.void_requests.all()),
+        "may_answer": operator and voids.can_answer_void(trial, request.user),
+        "attempts": selectors.attempts_of(trial=trial),
         # Times of set-up and run would reveal how long a policy warms up.
-        "commands": () if hidden else selectors.commands_of(trial=found),
+        "commands": () if hidden else selectors.commands_of(trial=trial),
         "hidden": hidden,
-        "laid_out": bench_images(found),
-        "further": visible_labels(found, visibility_for_request(request)),
+        "laid_out": bench_images(trial),
+        "further": visible_labels(trial, visibility_for_request(request)),
         "fault": fault,
         "typed": typed,
         "failures": failures.failure_choices(typed),
@@ -191,10 +191,10 @@ def _as_scored(trial: Trial) -> dict[str, Any]:
     return {"note": verdict.note, "success": success, **failures.score_failure(verdict)}
 
 
-def _filters(sight: Visibility) -> list[Filter]:
+def _filters(visibility: Visibility) -> list[Filter]:
     """Return the filters of the list of trials; TrialFilters reports unknown values."""
     scenes = selectors.scene_list(all_of_them=True).prefetch_related(None)
-    checkpoints = selectors.checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None)
+    checkpoints = selectors.checkpoint_list(all_of_them=True, sight=visibility).prefetch_related(None)
     evaluations = [(str(row.pk), str(row)) for row in selectors.evaluation_list()]
     return [
         Filter("scene", "Scene", [(row.name, row.title) for row in scenes], strict=False),
@@ -211,7 +211,7 @@ def _filters(sight: Visibility) -> list[Filter]:
     ]
 
 
-def _columns(sight: Visibility) -> list[Column]:
+def _columns(visibility: Visibility) -> list[Column]:
     """Return the columns of the list of trials.
 
     Sorting by checkpoint is offered only if no checkpoint is hidden, because the order would reveal it.
@@ -221,8 +221,8 @@ def _columns(sight: Visibility) -> list[Column]:
         Column("prepared", "Prepared", ("prepared_at",), down=True),
         Column("scene", "Scene", ("scene__title", "position__number")),
         Column("position", "Position", ("position__number",), number=True),
-        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if sight.hides_nothing else ()),
-        Column("number", "No.", ("number", "attempt") if sight.hides_nothing else (), number=True),
+        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if visibility.hides_nothing else ()),
+        Column("number", "No.", ("number", "attempt") if visibility.hides_nothing else (), number=True),
         Column("status", "Status", ("status",)),
         Column("success", "Success", ("verdict__success",), down=True),
         Column("score", "Score", ("verdict__score",), number=True),

@@ -69,8 +69,8 @@ def needs_two_people(trial: Trial) -> bool:
 
 def can_answer_void(trial: Trial, user: User) -> bool:
     """Return True if the trial has an open void request that this user may answer."""
-    asked = trial.void_requests.filter(answer="").first()
-    return asked is not None and _why_not(asked, user) is None
+    request = trial.void_requests.filter(answer="").first()
+    return request is not None and _why_not(request, user) is None
 
 
 def void_trial(*, user: User, trial: Trial, reason: str) -> Trial:
@@ -79,19 +79,19 @@ def void_trial(*, user: User, trial: Trial, reason: str) -> Trial:
     A void is not a failure: the trial stays in the record with the reason, and is repeated.
     """
     require_role(user, Role.OPERATOR)
-    why = require_reason(reason, "a trial is voided")
+    text = require_reason(reason, "a trial is voided")
     with transaction.atomic():
         run_checks("voided", trial, user)
-        held = lock_trial(trial)
-        if _already_requested(held, user, why):
-            return held
-        if held.status == TrialStatus.VOID_ASKED:
-            raise Conflict(_ASKED_ALREADY(trial=held.pk, advice=lifecycle.advice(held.status)))
-        if needs_two_people(held):
-            _ask(held, user, why)
+        locked = lock_trial(trial)
+        if _already_requested(locked, user, text):
+            return locked
+        if locked.status == TrialStatus.VOID_ASKED:
+            raise Conflict(_ASKED_ALREADY(trial=locked.pk, advice=lifecycle.advice(locked.status)))
+        if needs_two_people(locked):
+            _ask(locked, user, text)
         else:
-            _void(held, user, why)
-        notify_settled(held, user)
+            _void(locked, user, text)
+        notify_settled(locked, user)
     trial.refresh_from_db()
     return trial
 
@@ -99,22 +99,22 @@ def void_trial(*, user: User, trial: Trial, reason: str) -> Trial:
 def answer_void(*, user: User, trial: Trial, agree: bool, reason: str = "") -> Trial:
     """Agree to another operator's void request, or refuse it with a reason."""
     require_role(user, Role.OPERATOR)
-    why = reason if agree and not reason.strip() else require_reason(reason, "a void is refused")
+    text = reason if agree and not reason.strip() else require_reason(reason, "a void is refused")
     with transaction.atomic():
-        held = lock_trial(trial)
-        asked = held.void_requests.filter(answer="").select_for_update().first()
-        if asked is None:
-            raise Conflict(_NOBODY_ASKS(trial=held.pk, label=TrialStatus(held.status).label))
-        fault = _why_not(asked, user)
+        locked = lock_trial(trial)
+        request = locked.void_requests.filter(answer="").select_for_update().first()
+        if request is None:
+            raise Conflict(_NOBODY_ASKS(trial=locked.pk, label=TrialStatus(locked.status).label))
+        fault = _why_not(request, user)
         if fault is not None:
             raise fault
         if agree:
-            run_checks("void agreed", held, user)
-            _answered(asked, VoidRequest.Answer.AGREED, user, why)
-            _void(held, asked.by, asked.reason)
+            run_checks("void agreed", locked, user)
+            _answered(request, VoidRequest.Answer.AGREED, user, text)
+            _void(locked, request.by, request.reason)
         else:
-            _restore_counting(held, asked, VoidRequest.Answer.REFUSED, user, why)
-        notify_settled(held, user)
+            _restore_counting(locked, request, VoidRequest.Answer.REFUSED, user, text)
+        notify_settled(locked, user)
     trial.refresh_from_db()
     return trial
 
@@ -129,70 +129,72 @@ def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = Fals
 
     Trials with an unfinished repetition wait for its end. Call within a transaction.
     """
-    asked = open_void_requests(trials)
+    requests = open_void_requests(trials)
     if not now:
-        asked = asked.filter(at__lt=timezone.now() - ANSWERED_WITHIN)
-    for each in asked.order_by("pk"):
-        held = lock_trial(each.trial)
-        each.refresh_from_db(fields=("answer",))
-        if each.answer:
+        requests = requests.filter(at__lt=timezone.now() - ANSWERED_WITHIN)
+    for request in requests.order_by("pk"):
+        locked = lock_trial(request.trial)
+        request.refresh_from_db(fields=("answer",))
+        if request.answer:
             continue  # answered in this loop with the trial that this one repeats
-        if not _repetitions(held).filter(status__in=lifecycle.OPEN_STATES).exists():
-            _restore_counting(held, each, VoidRequest.Answer.LAPSED, user, "")
+        if not _repetitions(locked).filter(status__in=lifecycle.OPEN_STATES).exists():
+            _restore_counting(locked, request, VoidRequest.Answer.LAPSED, user, "")
 
 
-def _why_not(asked: VoidRequest, user: User) -> EvaError | None:
+def _why_not(request: VoidRequest, user: User) -> EvaError | None:
     """Return the error for a user who may not answer the request; None if they may."""
-    if asked.by_id == user.pk:
-        return NotAllowed(_ASKED_BY_YOU(trial_id=asked.trial_id))
-    if asked.at + ANSWERED_WITHIN < timezone.now():
-        return Conflict(_ASKED_TOO_LONG_AGO(trial_id=asked.trial_id, days=ANSWERED_WITHIN.days))
+    if request.by_id == user.pk:
+        return NotAllowed(_ASKED_BY_YOU(trial_id=request.trial_id))
+    if request.at + ANSWERED_WITHIN < timezone.now():
+        return Conflict(_ASKED_TOO_LONG_AGO(trial_id=request.trial_id, days=ANSWERED_WITHIN.days))
     try:
-        run_checks("void answered", asked.trial, user)
+        run_checks("void answered", request.trial, user)
     except EvaError as fault:
         return fault
     return None
 
 
-def _ask(held: Trial, user: User, why: str) -> None:
-    lifecycle.apply(held, Transition.ASK)
-    asked = VoidRequest(trial=held, reason=why, by=user)
-    JUDGEMENTS.append(journal_uuid(held), VoidRequestLine.written(asked))
-    asked.save()
-    held.save()
+def _ask(trial: Trial, user: User, reason: str) -> None:
+    lifecycle.apply(trial, Transition.ASK)
+    request = VoidRequest(trial=trial, reason=reason, by=user)
+    JUDGEMENTS.append(journal_uuid(trial), VoidRequestLine.written(request))
+    request.save()
+    trial.save()
 
 
-def _answered(asked: VoidRequest, answer: str, user: User, why: str) -> None:
-    asked.answer, asked.answer_reason, asked.answered_by = answer, why, user
-    asked.answered_at = timezone.now()
-    JUDGEMENTS.append(journal_uuid(asked.trial), VoidAnswerLine.written(asked, uuid=str(asked.uuid)))
-    asked.save()
+def _answered(request: VoidRequest, answer: str, user: User, reason: str) -> None:
+    request.answer, request.answer_reason, request.answered_by = answer, reason, user
+    request.answered_at = timezone.now()
+    JUDGEMENTS.append(journal_uuid(request.trial), VoidAnswerLine.written(request, uuid=str(request.uuid)))
+    request.save()
 
 
-def _void(held: Trial, by: User, why: str) -> None:
-    lifecycle.apply(held, Transition.VOID)
-    held.reason, held.voided_by, held.voided_at = why, by, timezone.now()
-    JUDGEMENTS.append(journal_uuid(held), VoidLine.written(held))
-    held.save()
-    request_publication(held)
+def _void(trial: Trial, by: User, reason: str) -> None:
+    lifecycle.apply(trial, Transition.VOID)
+    trial.reason, trial.voided_by, trial.voided_at = reason, by, timezone.now()
+    JUDGEMENTS.append(journal_uuid(trial), VoidLine.written(trial))
+    trial.save()
+    request_publication(trial)
 
 
-def _restore_counting(held: Trial, asked: VoidRequest, answer: str, user: User, why: str) -> None:
+def _restore_counting(trial: Trial, request: VoidRequest, answer: str, user: User, reason: str) -> None:
     """Make the trial count again and void its repetitions."""
-    for other in _repetitions(held):
-        if other.status in lifecycle.OPEN_STATES:
+    for repetition in _repetitions(trial):
+        if repetition.status in lifecycle.OPEN_STATES:
             raise Conflict(
-                _BEING_REPEATED(trial=held.pk, other=other.pk, advice=lifecycle.advice(other.status))
+                _BEING_REPEATED(
+                    trial=trial.pk, other=repetition.pk, advice=lifecycle.advice(repetition.status)
+                )
             )
-        if lifecycle.allows(other, Transition.VOID):
-            row = lock_trial(other)
+        if lifecycle.allows(repetition, Transition.VOID):
+            row = lock_trial(repetition)
             for pending in row.void_requests.filter(answer=""):
                 lifecycle.apply(row, Transition.KEEP)
                 _answered(pending, VoidRequest.Answer.LAPSED, user, KEPT)
             _void(row, user, KEPT)
-    lifecycle.apply(held, Transition.KEEP)
-    _answered(asked, answer, user, why)
-    held.save()
+    lifecycle.apply(trial, Transition.KEEP)
+    _answered(request, answer, user, reason)
+    trial.save()
 
 
 def _repetitions(trial: Trial) -> QuerySet[Trial]:
@@ -200,8 +202,8 @@ def _repetitions(trial: Trial) -> QuerySet[Trial]:
     return Trial.objects.filter(**{name: getattr(trial, name) for name in same}, attempt__gt=trial.attempt)
 
 
-def _already_requested(held: Trial, user: Any, why: str) -> bool:
+def _already_requested(trial: Trial, user: Any, reason: str) -> bool:
     """Return True if this repeats a request whose answer was lost."""
-    if held.status == TrialStatus.VOID_ASKED:
-        return held.void_requests.filter(answer="", by=user, reason=why).exists()
-    return (held.status, held.reason, held.voided_by_id) == (TrialStatus.VOIDED, why, user.pk)
+    if trial.status == TrialStatus.VOID_ASKED:
+        return trial.void_requests.filter(answer="", by=user, reason=reason).exists()
+    return (trial.status, trial.reason, trial.voided_by_id) == (TrialStatus.VOIDED, reason, user.pk)

@@ -113,7 +113,7 @@ def _group(
     return GroupDraft(
         name=limb.name,
         kind=limb.kind,
-        optional=limb.kind not in ("arm", "hand") and any(other.kind == "arm" for other in limbs),
+        optional=limb.kind not in ("arm", "hand") and any(guess.kind == "arm" for guess in limbs),
         numbers=(*limb.joints, *([gripper.driver] if gripper else [])),
         urdf_joints=limb.joints,
         frame=limb.above if eef_link is not None else None,
@@ -151,13 +151,13 @@ def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[s
 
     Only the first arm gets them; {} for every other limb.
     """
-    if limb.kind != "arm" or limb is not next(other for other in limbs if other.kind == "arm"):
+    if limb.kind != "arm" or limb is not next(guess for guess in limbs if guess.kind == "arm"):
         return {}
-    others = [other for other in limbs if other.kind in ("torso", "head", "other", "base")]
+    carriers = [guess for guess in limbs if guess.kind in ("torso", "head", "other", "base")]
     values = {
         name: value
-        for other in others
-        for name, value in zip(other.joints, _rest_joints(tree, other.joints), strict=True)
+        for guess in carriers
+        for name, value in zip(guess.joints, _rest_joints(tree, guess.joints), strict=True)
     }
     return {name: value for name, value in values.items() if value}
 

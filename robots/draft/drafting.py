@@ -53,18 +53,18 @@ def draft_robot(name: str, source: Path, into: Path, copies: int = 1) -> DraftRe
     title = urdf.document(source).get("name") or name
     into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{name}-", dir=into) as scratch:
-        made = Path(scratch) / name
-        made.mkdir()
-        shown = made / f"{name}.urdf"
+        draft = Path(scratch) / name
+        draft.mkdir()
+        copied = draft / f"{name}.urdf"
         try:
-            pictures = copy_urdf(tree, shown)
-            guessed = build_draft(tree, shown, pictures.drawn, title, copies)
-            (made / "README.md").write_text(render_readme(name, guessed, pictures), "utf-8")
-            _write(made, guessed)
+            pictures = copy_urdf(tree, copied)
+            guessed = build_draft(tree, copied, pictures.drawn, title, copies)
+            (draft / "README.md").write_text(render_readme(name, guessed, pictures), "utf-8")
+            _write(draft, guessed)
         except RobotError as error:  # messages name temporary files that no longer exist when they are read
-            said = str(error).replace(str(shown), str(source)).replace(str(made), str(folder))
-            raise RobotError(said) from None
-        made.rename(folder)
+            text = str(error).replace(str(copied), str(source)).replace(str(draft), str(folder))
+            raise RobotError(text) from None
+        draft.rename(folder)
     return DraftResult(folder, pictures, inspect_robot(folder))
 
 
@@ -88,10 +88,10 @@ def _write(folder: Path, guessed: RobotDraft) -> None:
     file.write_text(render_robot_toml(guessed, {"home": home}, ()), "utf-8")
     robot = load_robot(folder, [group.name for group in guessed.groups])
     postures = PostureSearch(robot, urdf.read(robot.urdf))
-    found = {"home": postures.home()}
-    found["ready"] = postures.ready(found["home"])
-    poses = {name: _parts(robot, q) for name, q in found.items()}
-    file.write_text(render_robot_toml(guessed, poses, postures.touching(found)), "utf-8")
+    by_name = {"home": postures.home()}
+    by_name["ready"] = postures.ready(by_name["home"])
+    poses = {name: _parts(robot, q) for name, q in by_name.items()}
+    file.write_text(render_robot_toml(guessed, poses, postures.touching(by_name)), "utf-8")
 
 
 def _parts(robot: Robot, q: Float64) -> Mapping[str, Sequence[float]]:

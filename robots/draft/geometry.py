@@ -16,22 +16,22 @@ def places(tree: Urdf, values: Mapping[str, float]) -> dict[str, Float64]:
     """Return the transform root <- link [4, 4] by link, for values of independent joints [rad or m]; missing ones are
     0.
     """
-    found = {tree.root: np.eye(4)}
+    frames = {tree.root: np.eye(4)}
     for joint in tree.outwards():
-        here = joint.origin
+        transform = joint.origin
         if joint.kind != "fixed":
             master, factor, offset = tree.master(joint)
             value = np.array([factor * values.get(master.name, 0.0) + offset])
-            here = motions(value, motion_table(joint.origin, joint)[None])[0]
-        found[joint.child] = found[joint.parent] @ here
-    return found
+            transform = motions(value, motion_table(joint.origin, joint)[None])[0]
+        frames[joint.child] = frames[joint.parent] @ transform
+    return frames
 
 
 def corners(shapes: Iterable[Shape]) -> dict[str, Float64]:
     """Return by link the corners [n, 3] of the bounding boxes of its shapes, in the link's frame."""
-    found: dict[str, list[Float64]] = {}
+    by_link: dict[str, list[Float64]] = {}
     for shape in shapes:
-        found.setdefault(shape.link, []).append(
+        by_link.setdefault(shape.link, []).append(
             shape.box_corners() @ shape.origin[:3, :3].T + shape.origin[:3, 3]
         )
-    return {link: np.concatenate(boxes) for link, boxes in found.items()}
+    return {link: np.concatenate(boxes) for link, boxes in by_link.items()}

@@ -107,12 +107,12 @@ def _range(joint: Joint, doubts: list[str]) -> tuple[float, float]:
     return 0.0, _SLIDE if joint.kind == "prismatic" else _TURN
 
 
-def _velocity(joint: Joint, way: float, doubts: list[str]) -> float:
+def _velocity(joint: Joint, travel: float, doubts: list[str]) -> float:
     if joint.velocity is not None and 0 < joint.velocity <= FASTEST:
         return joint.velocity
-    given = "no velocity" if joint.velocity is None else f"{joint.velocity:g}/s"
-    doubts.append(f"the URDF gives {joint.name} {given}: the whole way in {_SECONDS:g} s is a placeholder")
-    return round(way / _SECONDS, 4)
+    value = "no velocity" if joint.velocity is None else f"{joint.velocity:g}/s"
+    doubts.append(f"the URDF gives {joint.name} {value}: the whole way in {_SECONDS:g} s is a placeholder")
+    return round(travel / _SECONDS, 4)
 
 
 def _independent_fingers(tree: Urdf, limb: GroupGuess, driver: str) -> dict[str, tuple[float, float]]:
@@ -153,7 +153,7 @@ class _Jaws:
         """
         choices = [
             {driver: ends} | dict(zip(others, turned, strict=True))
-            for turned in product(*((way, way[::-1]) for way in others.values()))
+            for turned in product(*((limits, limits[::-1]) for limits in others.values()))
         ]
         return max(choices, key=lambda fingers: max(self._partings(fingers)))
 
@@ -210,24 +210,26 @@ class _Jaws:
 
     def _end(self, branch: list[str], at: Mapping[str, Float64]) -> tuple[str, Float64]:
         """Return the link of a branch that extends farthest, and the centre of that link's far end in its own frame."""
-        seen = {link: self._points_in_eef(link, at) for link in branch}
-        link = max(branch, key=lambda name: float((seen[name] @ self._z).max()))
-        along = seen[link] @ self._z
+        points = {link: self._points_in_eef(link, at) for link in branch}
+        link = max(branch, key=lambda name: float((points[name] @ self._z).max()))
+        along = points[link] @ self._z
         near, far = along.min(), along.max()
-        end = seen[link][along >= far - 0.3 * (far - near)].mean(axis=0)
+        end = points[link][along >= far - 0.3 * (far - near)].mean(axis=0)
         return link, np.linalg.inv(at[link]) @ np.append(end, 1.0)
 
     def _partings(self, fingers: Mapping[str, tuple[float, float]]) -> list[float]:
         """Return for each pair of branches how much it parts between the limits [m]."""
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
-        ways = [self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs]
-        return [float(np.linalg.norm(way)) for way in ways]
+        displacements = [
+            self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs
+        ]
+        return [float(np.linalg.norm(displacement)) for displacement in displacements]
 
     def _opens_along(self, closed: Mapping[str, float]) -> Float64:
         """Return the direction in the end effector in which the fingers begin to part when they open."""
         step = {name: value + 1e-3 for name, value in closed.items()}
-        ways = [self._between(pair, step) - self._between(pair, closed) for pair in self._pairs]
-        return max(ways, key=lambda way: float(np.linalg.norm(way)))
+        displacements = [self._between(pair, step) - self._between(pair, closed) for pair in self._pairs]
+        return max(displacements, key=lambda way: float(np.linalg.norm(way)))
 
     def _between(self, pair: tuple[int, int], values: Mapping[str, float]) -> Float64:
         at = self._in_eef(values)
@@ -251,21 +253,21 @@ class _Jaws:
         return np.asarray(shapes @ at[link][:3, :3].T + at[link][:3, 3])
 
     def _centre(self, link: str, at: Mapping[str, Float64]) -> Float64:
-        seen = self._points_in_eef(link, at)
-        return np.asarray((seen.min(axis=0) + seen.max(axis=0)) / 2)
+        points = self._points_in_eef(link, at)
+        return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
     def _reach(self, at: Mapping[str, Float64]) -> float | None:
         """Return how far the fingers' shapes extend along z, None if there are no shapes."""
-        shown = [link for branch in self._branches for link in branch if link in self._corners]
-        return max((float((self._points_in_eef(link, at) @ self._z).max()) for link in shown), default=None)
+        visible = [link for branch in self._branches for link in branch if link in self._corners]
+        return max((float((self._points_in_eef(link, at) @ self._z).max()) for link in visible), default=None)
 
 
 def _behind(tree: Urdf, link: str, *, rigid: bool = False) -> list[str]:
     """Return the link and all its descendants, from it outwards; with `rigid` only those that are fixed to it."""
-    found = [link]
-    for here in found:  # the list grows during the loop
-        found += [joint.child for joint in tree.children(here) if not rigid or joint.kind == "fixed"]
-    return found
+    links = [link]
+    for parent in links:  # the list grows during the loop
+        links += [joint.child for joint in tree.children(parent) if not rigid or joint.kind == "fixed"]
+    return links
 
 
 def _along(direction: Float64) -> Float64:

@@ -104,30 +104,30 @@ class _Skeleton:
 
     def fingers(self, wheels: set[str]) -> dict[str, str | None]:
         """Return by finger joint the joint that carries its hand, None if that is the root."""
-        found: set[str] = set()
+        names: set[str] = set()
         for name in reversed(self.names):  # from the tips inwards
-            if name not in wheels and found.issuperset(self.children(name)) and self._is_finger(name):
-                found.add(name)
+            if name not in wheels and names.issuperset(self.children(name)) and self._is_finger(name):
+                names.add(name)
         carriers: dict[str, str | None] = {}
         for name in self.names:
-            if name in found:
+            if name in names:
                 carrier = self.parent[name]
-                while carrier in found:
+                while carrier in names:
                     carrier = self.parent[carrier]
                 carriers[name] = carrier
         return carriers
 
     def runs(self, without: set[str]) -> list[tuple[tuple[str, ...], bool]]:
         """Return the unbranched rows of joints, outwards, each with whether its branch of the tree ends with it."""
-        found: list[tuple[tuple[str, ...], bool]] = []
+        result: list[tuple[tuple[str, ...], bool]] = []
         starts = self.children(None, without)
         for start in starts:  # the list grows during the loop
             run = [start]
             while len(behind := self.children(run[-1], without)) == 1:
                 run += behind
-            found.append((tuple(run), not behind))
+            result.append((tuple(run), not behind))
             starts += behind
-        return found
+        return result
 
     def _next_above(self, link: str) -> str | None:
         while (joint := self.tree.above(link)) is not None:
@@ -145,12 +145,12 @@ class _Skeleton:
             return True
         if behind:
             return False
-        beside = [other for other in self.children(self.parent[name]) if other != name]
-        twins = [other for other in beside if self.tree.joint(other).parent == joint.parent]
-        if not twins or any(self.children(other) for other in beside):
+        siblings = [sibling for sibling in self.children(self.parent[name]) if sibling != name]
+        twins = [sibling for sibling in siblings if self.tree.joint(sibling).parent == joint.parent]
+        if not twins or any(self.children(sibling) for sibling in siblings):
             return False
         slides = joint.kind == "prismatic" and all(
-            self.tree.joint(other).kind == "prismatic" for other in twins
+            self.tree.joint(sibling).kind == "prismatic" for sibling in twins
         )
         return slides or (self.depth(self.parent[name]) >= _FORK and not _kind_of(name))
 
@@ -168,14 +168,14 @@ def _limbs(
     limbs = [_limb(skeleton, _kind(joints[:cut]) or "torso", joints[:cut])] if cut else []
     if not ends:
         return limbs
-    rest = joints[cut:]
-    kind = _kind(rest)
+    outer = joints[cut:]
+    kind = _kind(outer)
     if kind in (None, "torso", "base"):
-        long = len(rest) >= (_FORK if alone else _ARM_LENGTH)
+        long = len(outer) >= (_FORK if alone else _ARM_LENGTH)
         kind = "arm" if own or (long and kind is None) else kind
     kind = kind or "other"
     gripper = own if kind == "arm" and _one_gripper(skeleton, own) else ()
-    return [*limbs, replace(_limb(skeleton, kind, rest), fingers=gripper)]
+    return [*limbs, replace(_limb(skeleton, kind, outer), fingers=gripper)]
 
 
 def _trunk(tree: Urdf, joints: tuple[str, ...]) -> int:
@@ -210,27 +210,29 @@ def _loose(
     skeleton: _Skeleton, limbs: Sequence[GroupGuess], fingers: dict[str, str | None]
 ) -> list[GroupGuess]:
     """Return the hands: one group for all fingers with the same carrier that are not part of an arm's gripper."""
-    taken = {name for limb in limbs for name in limb.fingers}
+    assigned = {name for limb in limbs for name in limb.fingers}
     hands: dict[str | None, list[str]] = {}
     for name, carrier in fingers.items():
-        if name not in taken:
+        if name not in assigned:
             hands.setdefault(carrier, []).append(name)
     return [_limb(skeleton, "hand", tuple(names)) for names in hands.values()]
 
 
 def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
     """Return the limbs with all parts of the torso merged into one, and all parts of the base into one."""
-    found: list[GroupGuess] = []
+    merged: list[GroupGuess] = []
     for limb in limbs:
         same = next(
-            (i for i, other in enumerate(found) if other.kind == limb.kind in ("torso", "base")), None
+            (i for i, earlier in enumerate(merged) if earlier.kind == limb.kind in ("torso", "base")), None
         )
         if same is None:
-            found.append(limb)
+            merged.append(limb)
         else:
-            first = found[same]
-            found[same] = replace(first, joints=first.joints + limb.joints, wheels=first.wheels + limb.wheels)
-    return found
+            first = merged[same]
+            merged[same] = replace(
+                first, joints=first.joints + limb.joints, wheels=first.wheels + limb.wheels
+            )
+    return merged
 
 
 def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
@@ -265,8 +267,8 @@ def _has(name: str, parts: Iterable[str]) -> bool:
 
 
 def _kind_of(name: str) -> Kind | None:
-    words = _name_parts(name)
-    return next((kind for kind, telling in _WORDS if words & telling), None)
+    parts = _name_parts(name)
+    return next((kind for kind, telling in _WORDS if parts & telling), None)
 
 
 def _kind(joints: Sequence[str]) -> Kind | None:
@@ -279,9 +281,9 @@ def _kind(joints: Sequence[str]) -> Kind | None:
 def _side(tree: Urdf, joints: Sequence[str]) -> str:
     """Return the side that the names of most joints indicate, or else the names of their child links."""
     for names in (joints, [tree.joint(name).child for name in joints]):
-        told = np.array(
-            [[bool(_name_parts(name) & words) for words in _SIDES.values()] for name in names]
+        counts = np.array(
+            [[bool(_name_parts(name) & names_of_side) for names_of_side in _SIDES.values()] for name in names]
         ).sum(axis=0)
-        if told.max() * 2 > len(names) and told[0] != told[1]:
-            return list(_SIDES)[int(told.argmax())]
+        if counts.max() * 2 > len(names) and counts[0] != counts[1]:
+            return list(_SIDES)[int(counts.argmax())]
     return ""

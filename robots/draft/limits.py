@@ -19,12 +19,12 @@ def placeholder_limits(joint: Joint) -> OverrideTable | None:
     if not (bad_range or bad_speed):
         return None
     slides = joint.kind == "prismatic"
-    way = _SLIDE if slides else _TURN
+    travel = _SLIDE if slides else _TURN
     speed = _SLIDING if slides else _SPEED
     return OverrideTable(
         joint=joint.name,
-        lower=-way if bad_range else None,
-        upper=way if bad_range else None,
+        lower=-travel if bad_range else None,
+        upper=travel if bad_range else None,
         velocity=speed if bad_speed else None,
         reason=f"{' and '.join([*bad_range, *bad_speed])}: a placeholder, verify it on the robot",
     )

@@ -91,8 +91,8 @@ class _UrdfCopy:
                 mesh = None if geometry is None else geometry.find("mesh")
                 if mesh is not None and self._sized(mesh) and self._copied(mesh):
                     continue
-                given = [] if geometry is None or mesh is not None else list(geometry)
-                if len(given) == 1 and given[0].tag in shapes.KINDS and self._sized(given[0]):
+                elements = [] if geometry is None or mesh is not None else list(geometry)
+                if len(elements) == 1 and elements[0].tag in shapes.KINDS and self._sized(elements[0]):
                     continue
                 link.remove(visual)
                 if link not in self._bare:
@@ -138,9 +138,9 @@ class _UrdfCopy:
             self._bare = links
         for link in self._bare:
             if link.find("visual") is None:
-                shown = list(self._sticks(link.get("name", "")))
-                link.extend(shown)
-                self.drawn += [link.get("name", "")] if shown else []
+                sticks = list(self._sticks(link.get("name", "")))
+                link.extend(sticks)
+                self.drawn += [link.get("name", "")] if sticks else []
 
     def materials(self) -> None:
         """Remove references to undeclared materials; such shapes get the plain colour."""
@@ -175,16 +175,16 @@ class _UrdfCopy:
     def _sticks(self, link: str) -> Iterator[ET.Element]:
         """Yield cylinders from the link's origin to each of its joints, or a sphere if the chain ends with the link."""
         above = self._tree.above(link)
-        ways = [joint.origin[:3, 3] for joint in self._tree.children(link) if not self._is_frame(joint)]
-        long = [way for way in ways if np.linalg.norm(way) >= _SHORTEST]
+        offsets = [joint.origin[:3, 3] for joint in self._tree.children(link) if not self._is_frame(joint)]
+        long = [offset for offset in offsets if np.linalg.norm(offset) >= _SHORTEST]
         if not long and above is not None and above.kind != "fixed":
             yield _visual(np.zeros(3), "0 0 0", ET.Element("sphere", radius=f"{_KNOB:g}"))
-        for way in long:
-            length = float(np.linalg.norm(way))
+        for offset in long:
+            length = float(np.linalg.norm(offset))
             radius = min(max(_STICK * length, _THINNEST), _THICKEST)
-            pitch, yaw = math.acos(way[2] / length), math.atan2(way[1], way[0])
+            pitch, yaw = math.acos(offset[2] / length), math.atan2(offset[1], offset[0])
             stick = ET.Element("cylinder", radius=f"{radius:.4f}", length=f"{length:.4f}")
-            yield _visual(way / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
+            yield _visual(offset / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
 
     def _is_frame(self, joint: Joint) -> bool:
         """Return True if the joint leads to a link that is only a frame, such as the frame between fingertips."""
@@ -211,14 +211,14 @@ def _names(file: Path) -> Iterator[str]:
 
 def _places(source: Path, named: str) -> Iterator[Path]:
     """Yield paths at which a mesh of the URDF `source` may be: next to it, or in its package above it or next to it."""
-    scheme, separator, rest = named.partition("://")
+    scheme, separator, path = named.partition("://")
     folder = source.resolve().parent
     if not separator:
         yield folder / named
     elif scheme == "file":
-        yield Path(unquote(rest))
+        yield Path(unquote(path))
     elif scheme in ("package", "model"):
-        package, _, inside = rest.partition("/")
+        package, _, inside = path.partition("/")
         for above in (folder, *folder.parents):
             if above.name == package:
                 yield above / inside

@@ -71,8 +71,8 @@ class PostureSearch:
             counts = self._touching(tried)
             if counts.min() < fewest:
                 fewest = int(counts.min())
-                found = tried[counts == fewest]
-                best = found[np.abs(found - home).max(axis=1).argmin()]
+                best_ones = tried[counts == fewest]
+                best = best_ones[np.abs(best_ones - home).max(axis=1).argmin()]
         best = self._plain(best, home, fewest)
         self._looked_at &= (
             self._clearance.distances(best) >= MARGIN
@@ -96,21 +96,21 @@ class PostureSearch:
         """
         ready = home.copy()
         for arm in self._arms:
-            found = self._mirrored(arm, ready)
-            if found is ready or not self._clear_way(home, found):
-                found = self._search(arm, ready, home)
-            ready = found
+            posture = self._mirrored(arm, ready)
+            if posture is ready or not self._clear_way(home, posture):
+                posture = self._search(arm, ready, home)
+            ready = posture
         return ready
 
     def touching(self, poses: dict[str, Float64]) -> tuple[tuple[str, str], ...]:
         """Return the pairs of links that touch at one of these poses."""
-        found = {
+        pairs = {
             pair
             for q in poses.values()
             for pair, apart in zip(self._clearance.pairs, self._clearance.distances(q), strict=True)
             if apart < MARGIN
         }
-        return tuple(sorted(found))
+        return tuple(sorted(pairs))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
         """Return the number of pairs that are too close plus the number of arms that are too low, for postures [...,
@@ -134,9 +134,9 @@ class PostureSearch:
         return np.concatenate(arms) if arms else np.empty(0, dtype=np.intp)
 
     def _clear_way(self, home: Float64, ready: Float64) -> bool:
-        way = home + np.linspace(0.0, 1.0, _WAY)[:, None] * (ready - home)
-        high = self._heights(way).min(axis=0) >= np.minimum(_LOWEST, self._heights(home))
-        return bool(self._apart(way).min() >= min(MARGIN, float(self._apart(home))) and high.all())
+        path = home + np.linspace(0.0, 1.0, _WAY)[:, None] * (ready - home)
+        high = self._heights(path).min(axis=0) >= np.minimum(_LOWEST, self._heights(home))
+        return bool(self._apart(path).min() >= min(MARGIN, float(self._apart(home))) and high.all())
 
     def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
         """Return the best posture found for one arm that a straight path from home reaches clear of collisions.
@@ -175,8 +175,8 @@ class PostureSearch:
         It depends on position and direction of the fingertips, on joints near limits, and on the distance from home.
         """
         at = self._tips(arm, q)
-        wanted = np.array([self._side(arm) * _ASIDE, _AHEAD, _HEIGHT])
-        away = np.linalg.norm(at[:, :3, 3] - wanted, axis=-1) / 0.1
+        target = np.array([self._side(arm) * _ASIDE, _AHEAD, _HEIGHT])
+        away = np.linalg.norm(at[:, :3, 3] - target, axis=-1) / 0.1
         upright = 1 + at[:, 2, 2]  # 0 if the fingers point straight down
         dims = arm.joint_dims
         ranges = self._robot.upper[dims] - self._robot.lower[dims]
@@ -187,9 +187,9 @@ class PostureSearch:
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
         """Return a cost for how deep links collide, or fingertips are too low, at the posture and on the path to it."""
-        way = home + _LOOKED_AT[:, None, None] * (q - home)
-        deep = np.maximum(2 * CLEAR - self._apart(way), 0.0) + np.maximum(
-            _LOWEST - self._heights(way), 0.0
+        path = home + _LOOKED_AT[:, None, None] * (q - home)
+        deep = np.maximum(2 * CLEAR - self._apart(path), 0.0) + np.maximum(
+            _LOWEST - self._heights(path), 0.0
         ).sum(axis=-1)
         return np.asarray(20 * deep.max(axis=0) / CLEAR)
 
@@ -210,10 +210,10 @@ class PostureSearch:
         """
         if arm.name not in self._signs:
             return q
-        found, dims = q.copy(), arm.joint_dims
+        mirrored, dims = q.copy(), arm.joint_dims
         mirror = self._signs[arm.name] * q[..., self._arms[0].joint_dims]
-        found[..., dims] = np.clip(mirror, self._robot.lower[dims], self._robot.upper[dims])
-        return found
+        mirrored[..., dims] = np.clip(mirror, self._robot.lower[dims], self._robot.upper[dims])
+        return mirrored
 
     def _mirroring(self, first: Group, second: Group) -> Float64 | None:
         """Return for each joint the factor, 1 or -1, by which the values of `first` become those of `second` mirrored
@@ -225,17 +225,17 @@ class PostureSearch:
             return None
         at = places(self._tree, {})
         signs = []
-        for one, other in zip(first.urdf_joints, second.urdf_joints, strict=True):
-            joints = (self._tree.joint(one), self._tree.joint(other))
+        for left, right in zip(first.urdf_joints, second.urdf_joints, strict=True):
+            joints = (self._tree.joint(left), self._tree.joint(right))
             if joints[0].kind != joints[1].kind and "prismatic" in (joints[0].kind, joints[1].kind):
                 return None
-            here, there = (at[joint.child] for joint in joints)
+            left_frame, right_frame = (at[joint.child] for joint in joints)
             axes = [at[joint.child][:3, :3] @ joint.axis for joint in joints]
             slides = joints[0].kind == "prismatic"
             axis = axes[0] * (
                 [1, -1, 1] if slides else [-1, 1, -1]
             )  # a rotation axis is mirrored in the other direction
-            off = there[:3, 3] - here[:3, 3] * [1, -1, 1]
+            off = right_frame[:3, 3] - left_frame[:3, 3] * [1, -1, 1]
             off = (
                 off if slides else off - axis * (off @ axis)
             )  # the position of a rotation joint along its axis is irrelevant

@@ -50,10 +50,10 @@ def render_robot_toml(
 
 
 def _pose_comment(name: str) -> str:
-    what = (
+    description = (
         "where the robot rests, zero or near it" if name == "home" else "clear of the workspace, fingers down"
     )
-    return f"# {GUESS}: {what}; found by looking at shapes, so try it slowly."
+    return f"# {GUESS}: {description}; found by looking at shapes, so try it slowly."
 
 
 def _group(group: GroupDraft) -> Iterator[str]:
@@ -74,8 +74,8 @@ def _group(group: GroupDraft) -> Iterator[str]:
         yield "overrides = ["
         for override in group.overrides:
             sides = ((side, getattr(override, side)) for side in ("lower", "upper", "velocity"))
-            given = "".join(f" {side} = {value}," for side, value in sides if value is not None)
-            yield f"  {{ joint = {_text(override.joint)},{given} reason = {_text(override.reason)} }}, # {GUESS}"
+            values = "".join(f" {side} = {value}," for side, value in sides if value is not None)
+            yield f"  {{ joint = {_text(override.joint)},{values} reason = {_text(override.reason)} }}, # {GUESS}"
         yield "]"
     if group.gripper is not None:
         yield ""

@@ -49,15 +49,15 @@ class Backup:
         """
         try:
             about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
-            given = about["format"]
+            form = about["format"]
         except FileNotFoundError:
-            found = [each.path.name for each in backups_in(path)] if path.is_dir() else []
-            which = f"; in it are {', '.join(found)}: name one of them" if found else ""
+            names = [copy.path.name for copy in backups_in(path)] if path.is_dir() else []
+            which = f"; in it are {', '.join(names)}: name one of them" if names else ""
             raise BackupError(f"{path} is no whole backup: it has no {ABOUT}{which}") from None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BackupError(f"{path / ABOUT} cannot be read: {error}") from None
-        if given != FORMAT:
-            raise BackupError(f"{path} has format {given!r}; this program reads {FORMAT}")
+        if form != FORMAT:
+            raise BackupError(f"{path} has format {form!r}; this program reads {FORMAT}")
         return cls(path, about)
 
     @property
@@ -71,8 +71,8 @@ class Backup:
 
 def backups_in(folder: Path) -> list[Backup]:
     """Return the complete backups in a folder, oldest first."""
-    names = sorted(each for each in folder.iterdir() if (each / ABOUT).is_file() and each.suffix != _PARTIAL)
-    return [Backup.at(each) for each in names]
+    names = sorted(path for path in folder.iterdir() if (path / ABOUT).is_file() and path.suffix != _PARTIAL)
+    return [Backup.at(path) for path in names]
 
 
 def make(folder: Path, *, keep: int | None, tell: Tell) -> Backup:
@@ -119,14 +119,16 @@ def make(folder: Path, *, keep: int | None, tell: Tell) -> Backup:
 
 
 def _write(draft: Path, before: Backup | None, now: str, tell: Tell) -> None:
-    ours = databases.database()
+    backend = databases.database()
     tell("database")
-    counted = ours.write(draft / ours.file)
-    digest, size = digest_of(draft / ours.file)
+    counted = backend.write(draft / backend.file)
+    digest, size = digest_of(draft / backend.file)
     tell("files")
-    without = database_files(Path(settings.DATABASES["default"]["NAME"])) if ours.engine == "sqlite3" else []
-    known = (before.path / FILES, {each.path: each for each in before.listed()}) if before else None
-    files = FileCopies(Path(settings.DATA_DIR), draft / FILES, known, without)
+    without = (
+        database_files(Path(settings.DATABASES["default"]["NAME"])) if backend.engine == "sqlite3" else []
+    )
+    earlier = (before.path / FILES, {listed.path: listed for listed in before.listed()}) if before else None
+    files = FileCopies(Path(settings.DATA_DIR), draft / FILES, earlier, without)
     (draft / FILES).mkdir()
     count, bytes_ = write_list(draft / LIST, files.copy())
     about = {
@@ -134,8 +136,8 @@ def _write(draft: Path, before: Backup | None, now: str, tell: Tell) -> None:
         "made": now,
         "version": version("eva-web"),
         "database": {
-            "engine": ours.engine,
-            "file": ours.file,
+            "engine": backend.engine,
+            "file": backend.file,
             "bytes": size,
             "sha256": digest,
             "rows": dict(counted),
@@ -166,8 +168,8 @@ def verify(path: Path, tell: Tell) -> tuple[Backup, list[str]]:
             f"{backup.path / LIST} is not as it was written: its files cannot be verified",
         ]
     tell(f"{backup.about['files']['count']:,} files")
-    found = (_file_problem(backup.path / FILES / listed.path, listed) for listed in backup.listed())
-    return backup, [*problems, *filter(None, found)]
+    file_problems = (_file_problem(backup.path / FILES / listed.path, listed) for listed in backup.listed())
+    return backup, [*problems, *filter(None, file_problems)]
 
 
 def _database_problems(backup: Backup) -> Iterator[str]:
@@ -179,7 +181,7 @@ def _database_problems(backup: Backup) -> Iterator[str]:
     else:
         try:
             backend = databases.of(about["engine"])
-            if (found := backend.read(backup.database)) and found != about["rows"]:
+            if (rows := backend.read(backup.database)) and rows != about["rows"]:
                 yield f"{backup.database} has other numbers of rows than {ABOUT} says"
         except BackupError as error:
             yield str(error)
@@ -208,12 +210,13 @@ def restore(path: Path, tell: Tell) -> Backup:
         BackupError: If it fails. From the restore of the database on, a failure leaves the folder RESTORING, with
             which no lab starts.
     """
-    backup, ours = Backup.at(path.expanduser().absolute()), databases.database()
+    backup, backend = Backup.at(path.expanduser().absolute()), databases.database()
     about = backup.about["database"]
     data = Path(settings.DATA_DIR)
-    if about["engine"] != ours.engine:
+    if about["engine"] != backend.engine:
         raise BackupError(
-            f"{backup.path} is of {about['engine']}, the settings' database is {ours.engine}: set DATABASE_URL for that"
+            f"{backup.path} is of {about['engine']}, the settings' database is {backend.engine}: "
+            "set DATABASE_URL for that"
         )
     if unknown := sorted(set(about["migrations"]) - _known_migrations()):
         raise BackupError(
@@ -226,7 +229,7 @@ def restore(path: Path, tell: Tell) -> Backup:
         raise BackupError(f"{backup.path / LIST} is not as it was written")
     os.umask(0o077)
     draft = data / RESTORING
-    _require_empty(data, draft, ours)
+    _require_empty(data, draft, backend)
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir()
     try:
@@ -239,7 +242,7 @@ def restore(path: Path, tell: Tell) -> Backup:
             raise BackupError(f"{error.filename or draft}: {error.strerror}; nothing was put back") from error
         raise
     tell("database")
-    ours.restore(backup.database)
+    backend.restore(backup.database)
     if databases.rows() != about["rows"]:
         raise BackupError("the database has other numbers of rows than the backup: empty it, and try again")
     for top in list(draft.iterdir()):
@@ -270,14 +273,14 @@ def _replace(source: Path, target: Path) -> None:
     source.rename(target)
 
 
-def _require_empty(data: Path, draft: Path, ours: databases.Database) -> None:
-    ours.require_empty()
+def _require_empty(data: Path, draft: Path, backend: databases.Database) -> None:
+    backend.require_empty()
     allowed = {draft.name, *_STARTS_WITH}
-    if ours.engine == "sqlite3":
-        allowed |= {each.name for each in database_files(Path(settings.DATABASES["default"]["NAME"]))}
-    if found := sorted(each.name for each in data.iterdir() if each.name not in allowed):
+    if backend.engine == "sqlite3":
+        allowed |= {path.name for path in database_files(Path(settings.DATABASES["default"]["NAME"]))}
+    if names := sorted(path.name for path in data.iterdir() if path.name not in allowed):
         raise BackupError(
-            f"{data} has {', '.join(found[:5])}: a backup is put back into an empty data folder"
+            f"{data} has {', '.join(names[:5])}: a backup is put back into an empty data folder"
         )
 
 

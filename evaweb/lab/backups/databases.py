@@ -55,9 +55,9 @@ def of(engine: str) -> Database:
     Raises:
         BackupError: If the kind is not supported.
     """
-    for known in (_SQLite(), _PostgreSQL()):
-        if known.engine == engine:
-            return known
+    for backend in (_SQLite(), _PostgreSQL()):
+        if backend.engine == engine:
+            return backend
     raise BackupError(f"a database of {engine} cannot be backed up; allowed: sqlite3, postgresql")
 
 
@@ -70,11 +70,11 @@ def rows() -> Rows:
 
 
 def _counted(cursor: object, names: Mapping[str, str]) -> Rows:
-    found = {}
+    counts = {}
     for name, quoted in sorted(names.items()):
         cursor.execute(f"SELECT count(*) FROM {quoted}")  # type: ignore[attr-defined]
-        found[name] = int(cursor.fetchone()[0])  # type: ignore[attr-defined]
-    return found
+        counts[name] = int(cursor.fetchone()[0])  # type: ignore[attr-defined]
+    return counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +93,10 @@ class _SQLite:
             )
         path.touch(mode=0o600)
         with (
-            closing(sqlite3.connect(f"{self._path.as_uri()}?mode=ro", uri=True)) as ours,
+            closing(sqlite3.connect(f"{self._path.as_uri()}?mode=ro", uri=True)) as source,
             closing(sqlite3.connect(path)) as copy,
         ):
-            ours.backup(copy)  # all pages in one read transaction: writers continue in the write-ahead log
+            source.backup(copy)  # all pages in one read transaction: writers continue in the write-ahead log
             copy.execute("PRAGMA journal_mode=DELETE")  # a single file
         _sync(path)
         return self.read(path)
@@ -104,9 +104,9 @@ class _SQLite:
     def read(self, path: Path) -> Rows:
         try:
             with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as copy:
-                found = [row[0] for row in copy.execute("PRAGMA integrity_check")]
-                if found != ["ok"]:
-                    raise BackupError(f"{path}: {'; '.join(found[:5])}")
+                messages = [row[0] for row in copy.execute("PRAGMA integrity_check")]
+                if messages != ["ok"]:
+                    raise BackupError(f"{path}: {'; '.join(messages[:5])}")
                 if broken := copy.execute("PRAGMA foreign_key_check").fetchone():
                     raise BackupError(
                         f"{path}: row {broken[1]} of {broken[0]} refers to a row of {broken[2]} that is not there"
@@ -156,9 +156,9 @@ class _PostgreSQL:
         return {}
 
     def require_empty(self) -> None:
-        if found := rows():
+        if tables := rows():
             raise BackupError(
-                f"the database has tables ({', '.join(sorted(found)[:3])}): a backup is put back into an empty one"
+                f"the database has tables ({', '.join(sorted(tables)[:3])}): a backup is put back into an empty one"
             )
 
     def restore(self, path: Path) -> None:
@@ -182,13 +182,17 @@ class _PostgreSQL:
 
 def _call(command: list[str], environment: Mapping[str, str]) -> None:
     try:
-        done = subprocess.run(command, env=os.environ | dict(environment), capture_output=True, text=True)
+        completed = subprocess.run(
+            command, env=os.environ | dict(environment), capture_output=True, text=True
+        )
     except FileNotFoundError:
         raise BackupError(
             f"{command[0]} is not installed here: it comes with PostgreSQL's client programs"
         ) from None
-    if done.returncode:
-        raise BackupError(f"{command[0]}: {done.stderr.strip()[-2000:] or f'exit code {done.returncode}'}")
+    if completed.returncode:
+        raise BackupError(
+            f"{command[0]}: {completed.stderr.strip()[-2000:] or f'exit code {completed.returncode}'}"
+        )
 
 
 def _sync(path: Path) -> None:

@@ -108,20 +108,20 @@ class FileCopies:
 
         Once the seal exists, the recording's other files do not change any more.
         """
-        found = []
+        paths = []
         for folder, folders, files in os.walk(self._data / unit, onerror=_unless_gone):
             folders[:] = [name for name in folders if name not in _LEFT_OUT_ANYWHERE]
             links = [name for name in folders if os.path.islink(os.path.join(folder, name))]
             at = os.path.relpath(folder, self._data)
-            found += [f"{at}/{name}" for name in [*files, *links] if name not in _LEFT_OUT_ANYWHERE]
-        return iter(sorted(found, key=lambda path: (os.path.basename(path) not in SEALS, path)))
+            paths += [f"{at}/{name}" for name in [*files, *links] if name not in _LEFT_OUT_ANYWHERE]
+        return iter(sorted(paths, key=lambda path: (os.path.basename(path) not in SEALS, path)))
 
     def _signs(self, names: Iterable[str]) -> list[tuple[str, int, int, int]]:
         signs = []
         for name in names:
             with suppress(FileNotFoundError):
-                seen = os.lstat(self._data / name)
-                signs.append((name, seen.st_ino, seen.st_size, seen.st_mtime_ns))
+                status = os.lstat(self._data / name)
+                signs.append((name, status.st_ino, status.st_size, status.st_mtime_ns))
         return signs
 
     def _copied(self, names: Iterable[str]) -> Iterator[Listed]:
@@ -134,24 +134,24 @@ class FileCopies:
 
     def _copy(self, name: str) -> Listed | None:
         source, target = self._data / name, self._target / name
-        seen = os.lstat(source)
+        status = os.lstat(source)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.unlink(missing_ok=True)  # of the previous attempt
-        if stat.S_ISLNK(seen.st_mode):
+        if stat.S_ISLNK(status.st_mode):
             link = os.readlink(source)
             os.symlink(link, target)
-            return Listed(name, 0, "", 0o777, seen.st_mtime_ns, link)
-        if not stat.S_ISREG(seen.st_mode):
+            return Listed(name, 0, "", 0o777, status.st_mtime_ns, link)
+        if not stat.S_ISREG(status.st_mode):
             return None  # a socket or a pipe
-        if (same := self._unchanged(name, seen)) is not None:
+        if (same := self._unchanged(name, status)) is not None:
             os.link(self._before[0] / name, target)  # type: ignore[index]
             self.linked += 1
             return same
         return copied(source, target, name)
 
-    def _unchanged(self, name: str, seen: os.stat_result) -> Listed | None:
+    def _unchanged(self, name: str, status: os.stat_result) -> Listed | None:
         before = self._before[1].get(name) if self._before else None
-        if before is None or (before.bytes, before.mtime_ns, before.mode) != _signature(seen):
+        if before is None or (before.bytes, before.mtime_ns, before.mode) != _signature(status):
             return None
         return before
 
@@ -160,18 +160,18 @@ def copied(source: Path, target: Path, name: str) -> Listed:
     """Copy a regular file up to its current size; data appended meanwhile is not included."""
     try:
         with source.open("rb") as read, target.open("xb") as written:
-            seen = os.fstat(read.fileno())
-            digest, size = _through(read, written, seen.st_size)
+            status = os.fstat(read.fileno())
+            digest, size = _through(read, written, status.st_size)
             written.flush()
             os.fsync(written.fileno())
-        os.utime(target, ns=(seen.st_mtime_ns, seen.st_mtime_ns))
+        os.utime(target, ns=(status.st_mtime_ns, status.st_mtime_ns))
     except FileNotFoundError:
         raise
     except OSError as error:
         raise BackupError(
             f"{error.filename or source}: {error.strerror}; nothing was kept of this backup"
         ) from error
-    return Listed(name, size, digest, stat.S_IMODE(seen.st_mode), seen.st_mtime_ns)
+    return Listed(name, size, digest, stat.S_IMODE(status.st_mode), status.st_mtime_ns)
 
 
 def digest_of(path: Path) -> tuple[str, int]:
@@ -184,9 +184,9 @@ def write_list(path: Path, files: Iterable[Listed]) -> tuple[int, int]:
     """Write one line per file; return the numbers of files and bytes."""
     count = size = 0
     with path.open("x", encoding="ascii") as lines:
-        for each in files:
-            lines.write(json.dumps(asdict(each)) + "\n")
-            count, size = count + 1, size + each.bytes
+        for listed in files:
+            lines.write(json.dumps(asdict(listed)) + "\n")
+            count, size = count + 1, size + listed.bytes
         lines.flush()
         os.fsync(lines.fileno())
     return count, size
@@ -220,8 +220,8 @@ def _through(read: BinaryIO, written: BinaryIO | None, most: int | None) -> tupl
     return digest.hexdigest(), size
 
 
-def _signature(seen: os.stat_result) -> tuple[int, int, int]:
-    return seen.st_size, seen.st_mtime_ns, stat.S_IMODE(seen.st_mode)
+def _signature(status: os.stat_result) -> tuple[int, int, int]:
+    return status.st_size, status.st_mtime_ns, stat.S_IMODE(status.st_mode)
 
 
 def _unless_gone(error: OSError) -> None:

@@ -36,8 +36,8 @@ def write(path: Path, sight: Visibility, tell: Tell) -> list[str]:
     notes: list[str] = []
     draft = path.with_name(f".{path.name}")  # fixed name: a repeated job overwrites an interrupted one
     try:
-        made = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with os.fdopen(made, "wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
             _fill(packed, scrubber, sight, notes, tell)
         draft.replace(path)
     finally:
@@ -46,7 +46,7 @@ def write(path: Path, sight: Visibility, tell: Tell) -> list[str]:
 
 
 def _fill(
-    packed: zipfile.ZipFile, scrubber: Scrubber, sight: Visibility, notes: list[str], tell: Tell
+    packed: zipfile.ZipFile, scrubber: Scrubber, visibility: Visibility, notes: list[str], tell: Tell
 ) -> None:
     parts: dict[str, Any] = {}
     written: list[tuple[str, int]] = []
@@ -58,63 +58,65 @@ def _fill(
         packed.writestr(name, text)
         written.append((name, len(text.encode())))
 
-    for name, content in _parts(sight, notes, tell):
+    for name, content in _parts(visibility, notes, tell):
         parts[name] = scrubber.tree(content)
         put(name, json.dumps(parts[name], indent=1, default=str, ensure_ascii=False) + "\n")
     tell("logs")
-    for name, text in _logs(sight, notes):
+    for name, text in _logs(visibility, notes):
         put(name, scrubber.text(text))
     title = f"EVA Web, diagnostic bundle of {timezone.localtime():%Y-%m-%d %H:%M %Z}"
-    told = scrubber.tree(notes) or ["nothing was left out or cut"]
-    found = summary.sections(parts, written, [*told, "secrets: keys, passwords and tokens read (removed)"])
-    put("summary.txt", summary.as_text(title, found))
-    put("summary.html", summary.as_html(title, found))
+    remarks = scrubber.tree(notes) or ["nothing was left out or cut"]
+    sections = summary.sections(
+        parts, written, [*remarks, "secrets: keys, passwords and tokens read (removed)"]
+    )
+    put("summary.txt", summary.as_text(title, sections))
+    put("summary.html", summary.as_html(title, sections))
 
 
-def _parts(sight: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
-    if not sight.hides_nothing:
-        notes.append(f"logs, policies of deployments, and what tells of checkpoints: {sight.plans}")
+def _parts(visibility: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
+    if not visibility.hides_nothing:
+        notes.append(f"logs, policies of deployments, and what tells of checkpoints: {visibility.plans}")
     tell("versions and settings")
     yield "versions.json", contents.versions()
     yield "settings.json", contents.lab_settings()
     tell("the machine")
     yield "machine.json", contents.machine()
     tell("database and jobs")
-    yield from _guarded("the database", _of_database(sight), notes)
-    yield "programs.json", contents.programs(sight)
-    yield from _guarded("deployments", _deployments(sight), notes)
-    yield from _guarded("stations", _stations(sight, notes, tell), notes)
+    yield from _guarded("the database", _of_database(visibility), notes)
+    yield "programs.json", contents.programs(visibility)
+    yield from _guarded("deployments", _deployments(visibility), notes)
+    yield from _guarded("stations", _stations(visibility, notes, tell), notes)
 
 
-def _of_database(sight: Visibility) -> Iterator[Named]:
+def _of_database(visibility: Visibility) -> Iterator[Named]:
     yield "database.json", contents.database()
-    yield "jobs.json", contents.jobs(sight)
+    yield "jobs.json", contents.jobs(visibility)
 
 
-def _deployments(sight: Visibility) -> Iterator[Named]:
-    for name, tree in contents.deployment_files(sight):
+def _deployments(visibility: Visibility) -> Iterator[Named]:
+    for name, tree in contents.deployment_files(visibility):
         yield f"deployments/{name}.json", tree
 
 
-def _stations(sight: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
+def _stations(visibility: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
     for station in Station.objects.order_by("name"):
         tell(f"the station {station.name}")
-        found = contents.station_parts(station, sight)
-        named = ((f"stations/{station.name}/{part}.json", content) for part, content in found)
+        station_parts = contents.station_parts(station, visibility)
+        named = ((f"stations/{station.name}/{part}.json", content) for part, content in station_parts)
         yield from _guarded(f"station {station.name}", named, notes)
 
 
-def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Named]:
+def _guarded(label: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Named]:
     """Yield the parts that can be gathered; errors become notes, because a diagnosed lab may be broken anywhere."""
     try:
         yield from parts
     except (Error, OSError, EvaError) as error:
-        notes.append(f"{what} as far as it could not be read: {error}")
+        notes.append(f"{label} as far as it could not be read: {error}")
 
 
-def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
+def _logs(visibility: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
     """Yield names and ends of logs; no logs for blind readers, because logs name checkpoints and servers."""
-    if not sight.hides_nothing:
+    if not visibility.hides_nothing:
         return
     room = LONGEST_LOGS
     for path in contents.logs():
@@ -143,6 +145,6 @@ def visibility_for(user: Any) -> Visibility:
 
 def folder(user: Any) -> Path:
     """Return the folder of a user's bundles, which only that user may download."""
-    made = Path(settings.DATA_DIR) / "diagnosis" / str(user.pk)
-    made.mkdir(mode=0o700, parents=True, exist_ok=True)
-    return made
+    path = Path(settings.DATA_DIR) / "diagnosis" / str(user.pk)
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return path

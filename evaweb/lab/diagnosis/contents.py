@@ -69,7 +69,7 @@ def versions() -> dict[str, Any]:
         "python": platform.python_version(),
         "kernel": " ".join((platform.system(), platform.release(), platform.machine())),
         "system": system,
-        "packages": dict(sorted({one.name: one.version for one in distributions()}.items())),
+        "packages": dict(sorted({package.name: package.version for package in distributions()}.items())),
     }
 
 
@@ -80,12 +80,12 @@ def machine() -> list[dict[str, Any]]:
 
 def lab_settings() -> dict[str, Any]:
     """Return settings from the allow list, and the names of other variables that are set."""
-    ours = sorted(
+    names = sorted(
         name for name in os.environ if name.startswith("EVA_") or name in ("DATABASE_URL", "REDIS_URL")
     )
     return {
         "environment": {name: os.environ[name] for name in _SHOWN if name in os.environ},
-        "set_and_not_shown": [name for name in ours if name not in _SHOWN],
+        "set_and_not_shown": [name for name in names if name not in _SHOWN],
         "database": settings.DATABASES["default"]["ENGINE"].rpartition(".")[2],
         "time_zone": settings.TIME_ZONE,
         "now": timezone.localtime().isoformat(),
@@ -119,10 +119,10 @@ def jobs(sight: Visibility) -> list[dict[str, Any]]:
 
 def deployment_files(sight: Visibility) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and content of each deployment of a station or of the data folder, without comments."""
-    known = {one.name: one.path for one in deployments.stored_deployments()}
+    paths = {stored.name: stored.path for stored in deployments.stored_deployments()}
     for station in Station.objects.exclude(deployment=""):
-        known.setdefault(station.name, Path(station.deployment))
-    for name, path in sorted(known.items()):
+        paths.setdefault(station.name, Path(station.deployment))
+    for name, path in sorted(paths.items()):
         try:
             tree = tree_of(path)
         except ConfigurationError as fault:
@@ -155,8 +155,8 @@ def station_parts(station: Station, sight: Visibility) -> Iterator[tuple[str, An
 
 def logs() -> list[Path]:
     """Return the logs of this lab's programs, newest first."""
-    found = [path for path in (Path(settings.DATA_DIR) / "logs").glob("*.log*") if path.is_file()]
-    return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
+    files = [path for path in (Path(settings.DATA_DIR) / "logs").glob("*.log*") if path.is_file()]
+    return sorted(files, key=lambda path: path.stat().st_mtime, reverse=True)
 
 
 def programs(sight: Visibility) -> list[dict[str, Any]]:
@@ -166,17 +166,17 @@ def programs(sight: Visibility) -> list[dict[str, Any]]:
     """
     now = time.time()
     rows: list[dict[str, Any]] = [{"program": "lab", "runs": deployments.lab_runs()}]
-    seen = logs() if sight.hides_nothing else []
-    return rows + [{"program": path.stem, "silent_s": round(now - path.stat().st_mtime, 1)} for path in seen]
+    files = logs() if sight.hides_nothing else []
+    return rows + [{"program": path.stem, "silent_s": round(now - path.stat().st_mtime, 1)} for path in files]
 
 
-def _command(row: Command, sight: Visibility) -> dict[str, Any]:
-    hidden = not sight.hides_nothing and sight.redacts_events(row.station.name)
+def _command(row: Command, visibility: Visibility) -> dict[str, Any]:
+    hidden = not visibility.hides_nothing and visibility.redacts_events(row.station.name)
     return {
         "at": row.issued_at.isoformat(),
         "kind": row.kind,
         "user": row.user.get_username() if row.user else "",
         "status": row.status,
-        "reason": sight.redact_text(row.reason) if hidden else row.reason,
+        "reason": visibility.redact_text(row.reason) if hidden else row.reason,
         "args": {} if hidden else to_json_value(row.args),
     }

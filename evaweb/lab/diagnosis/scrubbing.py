@@ -86,8 +86,10 @@ class Scrubber:
     """Scrubber that removes secrets, and names that are hidden from the reader, from texts and trees."""
 
     def __init__(self, secrets: Iterable[str], hidden: Iterable[str] = ()) -> None:
-        known = sorted({one for one in secrets if len(one) >= _SHORTEST}, key=len, reverse=True)
-        self._known = re.compile("|".join(map(re.escape, known))) if known else None
+        longest_first = sorted(
+            {secret for secret in secrets if len(secret) >= _SHORTEST}, key=len, reverse=True
+        )
+        self._known = re.compile("|".join(map(re.escape, longest_first))) if longest_first else None
         hides = "|".join(map(re.escape, sorted(filter(None, hidden), key=len, reverse=True)))
         self._hidden = re.compile(rf"(?<!\w)(?:{hides})(?!\w)") if hides else None
 
@@ -102,9 +104,9 @@ class Scrubber:
     def tree(self, value: Any) -> Any:
         """Return JSON tables and lists without secrets; values under the name of a secret are always removed."""
         if isinstance(value, Mapping):
-            return {self.text(str(key)): self._under(str(key), one) for key, one in value.items()}
+            return {self.text(str(key)): self._under(str(key), item) for key, item in value.items()}
         if isinstance(value, list | tuple):
-            return [self.tree(one) for one in value]
+            return [self.tree(item) for item in value]
         return self.text(value) if isinstance(value, str) else value
 
     def _under(self, key: str, value: Any) -> Any:
@@ -119,14 +121,14 @@ def known_secrets() -> set[str]:
     """Return the secrets of this lab that this process can read: keys, passwords, environment variables."""
     data = Path(settings.DATA_DIR)
     files = [data / "secret_key", data / "first_account", *data.glob("stations/*/bus.key")]
-    found = {settings.SECRET_KEY, *(_read(path) for path in files)}
+    secrets = {settings.SECRET_KEY, *(_read(path) for path in files)}
     database = settings.DATABASES["default"]
-    found.add(str(database.get("PASSWORD") or ""))
-    kept = without_web_secrets(os.environ)
+    secrets.add(str(database.get("PASSWORD") or ""))
+    harmless = without_web_secrets(os.environ)
     for name, value in os.environ.items():
-        if name not in kept or _KEY.search(name) or _VARIABLES.search(name):
-            found |= {value, *_passwords(value)}
-    return {one for one in found if one}
+        if name not in harmless or _KEY.search(name) or _VARIABLES.search(name):
+            secrets |= {value, *_passwords(value)}
+    return {secret for secret in secrets if secret}
 
 
 def _read(path: Path) -> str:

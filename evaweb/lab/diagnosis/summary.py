@@ -30,7 +30,7 @@ def sections(
 
     `contents` are files with their sizes [bytes], `notes` sentences on what the bundle omits.
     """
-    versions, found = parts["versions.json"], parts["machine.json"]
+    versions, lines = parts["versions.json"], parts["machine.json"]
     rows = parts.get("database.json")
     migrations = f"{len(rows['migrations_to_apply'])} migrations to apply" if rows else "which cannot be read"
     failed = [job for job in parts.get("jobs.json", ()) if job["status"] == "failed"]
@@ -49,7 +49,7 @@ def sections(
         ),
         Section(
             "Machine",
-            tuple((f"{line['state']}: {line['name']}: {line['found']}", "") for line in found),
+            tuple((f"{line['state']}: {line['name']}: {line['found']}", "") for line in lines),
         ),
         Section("Stations", tuple(_stations(parts)) or (("none", ""),)),
         Section(
@@ -78,16 +78,16 @@ def as_html(title: str, found: Sequence[Section]) -> str:
     return f"<!doctype html><html lang='en'><head>{head}</head><body><h1>{escape(title)}</h1>{body}</body></html>\n"
 
 
-def _revision(found: Any) -> str:
-    if isinstance(found, str):
-        return found
-    return f"{found['commit'][:12]}{', with changes' if found['dirty'] else ''}"
+def _revision(revision: Any) -> str:
+    if isinstance(revision, str):
+        return revision
+    return f"{revision['commit'][:12]}{', with changes' if revision['dirty'] else ''}"
 
 
 def _item(line: tuple[str, str]) -> str:
-    said, file = line
+    text, file = line
     link = f" (<a href='{escape(file)}'>{escape(file)}</a>)" if file else ""
-    return f"<li>{escape(said)}{link}</li>"
+    return f"<li>{escape(text)}{link}</li>"
 
 
 def _stations(parts: dict[str, Any]) -> list[tuple[str, str]]:

@@ -49,27 +49,27 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
     """Return the agreement of two raters on yes/no pairs: share of equal ratings, Cohen's kappa, Gwet's AC1,
     Krippendorff's alpha.
     """
-    same = proportion(sum(one == other for one, other in pairs), len(pairs))
+    same = proportion(sum(first == second for first, second in pairs), len(pairs))
     return {
         "n": same.n,
         "same": same.successes,
         "wilson": [same.interval.low, same.interval.high] if same.interval else None,
         "kappa": _defined(cohen_kappa, pairs),
         "ac1": gwet_ac1(pairs),
-        "alpha": _defined(krippendorff_alpha, [[float(one), float(other)] for one, other in pairs]),
+        "alpha": _defined(krippendorff_alpha, [[float(first), float(second)] for first, second in pairs]),
     }
 
 
 def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return a dict from each milestone's text to its value; a repeated text is numbered in order: "held (2)"."""
-    found: dict[str, Any] = {}
-    for text, said in milestones:
+    by_label: dict[str, Any] = {}
+    for text, value in milestones:
         label, n = text, 1
-        while label in found:
+        while label in by_label:
             n += 1
             label = f"{text} ({n})"
-        found[label] = said
-    return found
+        by_label[label] = value
+    return by_label
 
 
 def _score_at(rating: Rating | Judgement) -> Score:
@@ -84,11 +84,11 @@ def _score_at(rating: Rating | Judgement) -> Score:
 def _milestones(verdicts: list[tuple[Score, Rating]]) -> dict[str, Any]:
     pairs: dict[str, list[tuple[bool, bool]]] = {}
     for verdict, rating in verdicts:
-        again = by_text((text, bool(reached)) for text, reached in rating.milestones)
+        reached_again = by_text((text, bool(reached)) for text, reached in rating.milestones)
         for text, reached in _scored(verdict).items():
-            if text in again:
-                pairs.setdefault(text, []).append((reached, again[text]))
-    return {text: agreement(found) for text, found in pairs.items()}
+            if text in reached_again:
+                pairs.setdefault(text, []).append((reached, reached_again[text]))
+    return {text: agreement(text_pairs) for text, text_pairs in pairs.items()}
 
 
 def _scored(score: Score) -> dict[str, bool]:
@@ -120,39 +120,39 @@ def judge_agreement(plan: Plan) -> list[dict[str, Any]] | None:
 
 
 def _judged(judge: str, version: str, rows: list[Judgement]) -> dict[str, Any]:
-    said: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
+    verdicts: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
     for row in rows:
-        words = by_text((text, own) for text, *own in row.milestones)
+        by_label = by_text((text, own) for text, *own in row.milestones)
         for text, reached in _scored(_score_at(row)).items():
-            if text in words:
-                said.setdefault(text, []).append((reached, *words[text]))
+            if text in by_label:
+                verdicts.setdefault(text, []).append((reached, *by_label[text]))
     return {
         "judge": judge,
         "version": version,
         "trials": len(rows),
         "no_verdict": dict(sorted(Counter(row.reason for row in rows if row.reason).items())),
-        "milestones": {text: _on_milestone(found) for text, found in said.items()},
-        "calibration": _calibration([one for found in said.values() for one in found]),
+        "milestones": {text: _on_milestone(triples) for text, triples in verdicts.items()},
+        "calibration": _calibration([triple for triples in verdicts.values() for triple in triples]),
     }
 
 
-def _on_milestone(said: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
-    pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
-    found = _calibration(said)
+def _on_milestone(verdicts: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
+    pairs = [(scored, reached) for scored, reached, _ in verdicts if reached is not None]
+    calibrated = _calibration(verdicts)
     return {
-        "no_verdict": len(said) - len(pairs),
+        "no_verdict": len(verdicts) - len(pairs),
         "agreement": agreement(pairs) if pairs else None,
-        "brier": found and found["brier"],
+        "brier": calibrated and calibrated["brier"],
     }
 
 
-def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any] | None:
+def _calibration(verdicts: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any] | None:
     """Return the calibration of a judge's probabilities against the scores; None if it gave no probability.
 
-    `said` has a triple per milestone: whether the score counts it as reached, the judge's verdict, its probability.
+    `verdicts` has a triple per milestone: whether the score counts it as reached, the judge's verdict, its probability.
     """
-    given = [(probability, scored) for scored, _, probability in said if probability is not None]
-    return asdict(calibration(given)) if given else None
+    probabilities = [(probability, scored) for scored, _, probability in verdicts if probability is not None]
+    return asdict(calibration(probabilities)) if probabilities else None
 
 
 def preference_comparisons(plan: Plan) -> list[Comparison]:
@@ -164,9 +164,9 @@ def preference_comparisons(plan: Plan) -> list[Comparison]:
     same = Q(first__checkpoint=F("second__checkpoint"))
     rows = Preference.objects.filter(~same, plan=plan).order_by("pk")
     names = ("first__checkpoint__name", "second__checkpoint__name", "outcome")
-    said = list(rows.values_list("first_id", "second_id", *names))
-    people = Counter((first, second) for first, second, *_ in said)
-    return [Comparison(*named, 1 / people[first, second]) for first, second, *named in said]
+    answers = list(rows.values_list("first_id", "second_id", *names))
+    people = Counter((first, second) for first, second, *_ in answers)
+    return [Comparison(*named, 1 / people[first, second]) for first, second, *named in answers]
 
 
 def preference_ranking(plan: Plan) -> dict[str, Any] | None:
@@ -175,16 +175,16 @@ def preference_ranking(plan: Plan) -> dict[str, Any] | None:
     If no finite, unique ranking exists, `ranking` is null, `reason` explains it, and each of `groups` can be ranked on
     its own.
     """
-    given = preference_comparisons(plan)
-    if not given:
+    comparisons = preference_comparisons(plan)
+    if not comparisons:
         return None
-    counted = {"n": len(given), "ties": sum(row.outcome == "tie" for row in given)}
+    counted = {"n": len(comparisons), "ties": sum(row.outcome == "tie" for row in comparisons)}
     nothing = {"ranking": None, "contrasts": [], "tie": None, "order": None, "order_z": None, "groups": []}
     try:
-        found = preferences(given, order_effect=True)
+        ranking = preferences(comparisons, order_effect=True)
     except StatisticsError:
         try:
-            found = preferences(given)
+            ranking = preferences(comparisons)
         except NotIdentifiedError as error:
             return {
                 **counted,
@@ -199,25 +199,25 @@ def preference_ranking(plan: Plan) -> dict[str, Any] | None:
         "ranking": [
             {
                 "checkpoint": name,
-                "worth": found.worth[name],
-                "error": found.error[name],
-                "rating": found.rating(name),
+                "worth": ranking.worth[name],
+                "error": ranking.error[name],
+                "rating": ranking.rating(name),
             }
-            for name in found.ranking
+            for name in ranking.ranking
         ],
         "contrasts": [
             {
-                "first": one,
-                "second": other,
+                "first": first,
+                "second": second,
                 "difference": row.difference,
                 "win_probability": row.win_probability,
                 "interval": [row.win_interval.low, row.win_interval.high],
             }
-            for (one, other), row in found.contrasts.items()
+            for (first, second), row in ranking.contrasts.items()
         ],
-        "tie": found.tie,
-        "order": found.order,
-        "order_z": found.order_z,
+        "tie": ranking.tie,
+        "order": ranking.order,
+        "order_z": ranking.order_z,
         "groups": [],
         "reason": "",
     }

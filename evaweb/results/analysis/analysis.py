@@ -72,13 +72,13 @@ class Analysis:
             "arms": {arm.checkpoint: arm.document for arm in self.arms},
             "comparisons": [comparison.document for comparison in self.comparisons],
             "recipes": {
-                found.name: {
-                    "rates": found.rates,
-                    "runs": found.mean.n,
-                    "mean": found.mean.value,
-                    "student": write_interval(found.mean.interval),
+                recipe.name: {
+                    "rates": recipe.rates,
+                    "runs": recipe.mean.n,
+                    "mean": recipe.mean.value,
+                    "student": write_interval(recipe.mean.interval),
                 }
-                for found in self.recipes
+                for recipe in self.recipes
             },
         }
 
@@ -122,7 +122,7 @@ def analyse(
     counts = {name: count_successes(trials) for name, trials in arms.items()}
     ranked = sorted(arms, key=lambda name: (-counts[name][0] / counts[name][1], name))
     couples = [_directed(couple, by_design) for couple in combinations(ranked, 2)]
-    tests = [barnard(*counts[one], *counts[other]) for one, other in couples]
+    tests = [barnard(*counts[first], *counts[second]) for first, second in couples]
     corrected = holm([test.p for test in tests])
     comparisons = tuple(
         compare(
@@ -141,7 +141,7 @@ def analyse(
         for couple, test, p in zip(couples, tests, corrected, strict=True)
     )
     apart = {frozenset((c.first, c.second)) for c in comparisons if _apart(c, by_design, alpha)}
-    told = all(by_design[c.first, c.second].apart is not None for c in comparisons if _is_planned(c))
+    all_decided = all(by_design[c.first, c.second].apart is not None for c in comparisons if _is_planned(c))
     return Analysis(
         len(outcomes),
         tuple(
@@ -155,7 +155,7 @@ def analyse(
             for name in ranked
         ),
         comparisons,
-        letters(ranked, apart) if told else {},
+        letters(ranked, apart) if all_decided else {},
         alpha,
         tuple(_imbalances(arms)),
         tuple(_recipes(arms, recipes or {})),
@@ -178,14 +178,14 @@ def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) 
             yield Recipe(recipe, rates, mean if len(rates) >= _FEWEST_RUNS else replace(mean, interval=None))
 
 
-def _is_planned(found: Comparison) -> bool:
-    return found.standing is not Standing.UNPLANNED
+def _is_planned(comparison: Comparison) -> bool:
+    return comparison.standing is not Standing.UNPLANNED
 
 
-def _apart(found: Comparison, by_design: Mapping[tuple[str, str], Verdict], alpha: float) -> bool:
-    if _is_planned(found):
-        return bool(by_design[found.first, found.second].apart)
-    return found.corrected is not None and found.corrected <= alpha
+def _apart(comparison: Comparison, by_design: Mapping[tuple[str, str], Verdict], alpha: float) -> bool:
+    if _is_planned(comparison):
+        return bool(by_design[comparison.first, comparison.second].apart)
+    return comparison.corrected is not None and comparison.corrected <= alpha
 
 
 def _directed(couple: tuple[str, str], planned: Iterable[tuple[str, str]]) -> tuple[str, str]:

@@ -107,12 +107,12 @@ def _count_speed(t: ArmTrials) -> Rate | None:
 
 
 def _follow_milestones(t: ArmTrials) -> tuple[Funnel, ...]:
-    found = []
+    funnels = []
     for scene, trials in t.scenes.items():
         if stones := trials[0].milestones:
             labels = trials[0].labels or tuple(str(i + 1) for i in range(len(stones)))
-            found.append(Funnel(scene, labels, tuple(funnel([o.milestones for o in trials]))))
-    return tuple(found)
+            funnels.append(Funnel(scene, labels, tuple(funnel([o.milestones for o in trials]))))
+    return tuple(funnels)
 
 
 def _count_failures(t: ArmTrials) -> tuple[FailureMode, ...]:
@@ -127,17 +127,17 @@ def _count_failures(t: ArmTrials) -> tuple[FailureMode, ...]:
     )
 
 
-def _write_funnels(found: Sequence[Funnel]) -> dict[str, Any]:
+def _write_funnels(funnels: Sequence[Funnel]) -> dict[str, Any]:
     return {
-        one.scene: [
+        funnel.scene: [
             {
                 "label": label,
                 "of_all": write_proportion(step.of_all),
                 "of_previous": write_proportion(step.of_previous),
             }
-            for label, step in zip(one.labels, one.steps, strict=True)
+            for label, step in zip(funnel.labels, funnel.steps, strict=True)
         ]
-        for one in found
+        for funnel in funnels
     }
 
 
@@ -181,28 +181,28 @@ def _write_failures(arm: Arm) -> dict[str, Any]:
     return {"failures": dict(by_cause), "failure_modes": modes}
 
 
-def _format_mean(found: BoundedMean, _: Arm) -> str:
-    return f"{100 * found.value:.0f} % [{format_interval(found.interval)}]"
+def _format_mean(mean: BoundedMean, _: Arm) -> str:
+    return f"{100 * mean.value:.0f} % [{format_interval(mean.interval)}]"
 
 
-def _format_time(found: RestrictedMean, _: Arm) -> str:
-    return f"{found.value:.1f} s [{found.interval.low:.1f}, {found.interval.high:.1f}], up to {found.until:.0f} s"
+def _format_time(time: RestrictedMean, _: Arm) -> str:
+    return f"{time.value:.1f} s [{time.interval.low:.1f}, {time.interval.high:.1f}], up to {time.until:.0f} s"
 
 
-def _format_speed(found: Rate, _: Arm) -> str:
-    return f"{found.per_hour:.1f} [{found.interval.low:.1f}, {found.interval.high:.1f}]"
+def _format_speed(rate: Rate, _: Arm) -> str:
+    return f"{rate.per_hour:.1f} [{rate.interval.low:.1f}, {rate.interval.high:.1f}]"
 
 
-def _format_between(found: Rate, _: Arm) -> str:
-    low = f"{found.mean_time_interval.low / 60:.0f}"
-    if found.mean_time is None:
-        return f"none in {found.exposure / 3600:.1f} h, at least {low} min"
-    high = found.mean_time_interval.high
-    return f"{found.mean_time / 60:.0f} min [{low}, {high / 60:.0f}]"
+def _format_between(rate: Rate, _: Arm) -> str:
+    low = f"{rate.mean_time_interval.low / 60:.0f}"
+    if rate.mean_time is None:
+        return f"none in {rate.exposure / 3600:.1f} h, at least {low} min"
+    high = rate.mean_time_interval.high
+    return f"{rate.mean_time / 60:.0f} min [{low}, {high / 60:.0f}]"
 
 
-def _format_average(found: Average, arm: Arm) -> str:
-    return average_text(found, arm.success.n)
+def _format_average(average: Average, arm: Arm) -> str:
+    return average_text(average, arm.success.n)
 
 
 @dataclass(frozen=True, slots=True)

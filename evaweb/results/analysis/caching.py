@@ -73,14 +73,14 @@ def corrected_of(plan: Plan, only: TrialFilter, at: Hashable = None) -> dict[str
         return {}
     at = at or fingerprint(plan)
     now = _corrected.get((plan.pk, plan.digest), at, lambda: load_plan_outcomes(plan, corrected=True))
-    found = {}
+    rates = {}
     before = by_checkpoint(only.apply(cached_runs(plan, at).outcomes))
     for name, rows in by_checkpoint(only.apply(now)).items():
         if [(o.trial, o.success, o.score) for o in rows] != [
             (o.trial, o.success, o.score) for o in before.get(name, [])
         ]:
-            found[name] = proportion(sum(o.success for o in rows), len(rows))
-    return found
+            rates[name] = proportion(sum(o.success for o in rows), len(rows))
+    return rates
 
 
 def cached_analysis(plan: Plan, only: TrialFilter | None = None, at: Hashable = None) -> Analysis:
@@ -119,17 +119,17 @@ def recipes_of(plan: Plan) -> dict[str, str]:
 
 def verdicts_of(plan: Plan) -> dict[tuple[str, str], Verdict]:
     """Return the design's verdict on each comparison of a plan; those of a draft are open."""
-    found, design = findings_of(plan), frozen_design(plan.document) if plan.document else None
-    if found is None or design is None:
+    results, design = findings_of(plan), frozen_design(plan.document) if plan.document else None
+    if results is None or design is None:
         return dict.fromkeys(planned(plan), Verdict())
     own = design.outcome if design.rule == ANYTIME else ""
     return {
         names: Verdict(
-            bool(one.ended),
-            one.winner is not None if one.ended and design.margin is None else None,
+            bool(conclusion.ended),
+            conclusion.winner is not None if conclusion.ended and design.margin is None else None,
             own,
         )
-        for names, one in zip(compared(plan.document or {}), found.each, strict=True)
+        for names, conclusion in zip(compared(plan.document or {}), results.each, strict=True)
     }
 
 

@@ -136,11 +136,11 @@ class ComparedTrials:
 
     def tables(self, stratum: str) -> dict[str, StratumTable]:
         """Return successes and trials of both checkpoints for each value of `stratum` at which both were tried."""
-        ours, theirs = (grouped(trials, STRATA[stratum]) for trials in (self.first, self.second))
+        first, second = (grouped(trials, STRATA[stratum]) for trials in (self.first, self.second))
         return {
-            name: StratumTable(*count_successes(ours[name]), *count_successes(theirs[name]))
-            for name in ours
-            if name in theirs
+            name: StratumTable(*count_successes(first[name]), *count_successes(second[name]))
+            for name in first
+            if name in second
         }
 
     @property
@@ -151,11 +151,11 @@ class ComparedTrials:
 
 
 def _compare_conditions(t: ComparedTrials) -> Difference:
-    ours, theirs = (
+    first, second = (
         {key: [float(o.success) for o in rows] for key, rows in grouped(arm, STRATA["condition"]).items()}
         for arm in (t.first, t.second)
     )
-    return over_conditions(ours, theirs, seed=SEED, level=LEVEL)
+    return over_conditions(first, second, seed=SEED, level=LEVEL)
 
 
 def _stratify(t: ComparedTrials) -> Stratified | None:
@@ -165,22 +165,22 @@ def _stratify(t: ComparedTrials) -> Stratified | None:
 
 
 def _test_within(t: ComparedTrials) -> dict[str, Within]:
-    found = {}
+    tests = {}
     for name in STRATA:
         tables = list(t.tables(name).values())
         p = exact_within(tables)
         if p is not None:
-            found[name] = Within(p, len(tables))
-    return found
+            tests[name] = Within(p, len(tables))
+    return tests
 
 
 def _test_times(t: ComparedTrials) -> SignFlipTest | None:
     timing = t.timing
-    known = [p for p in t.pairs if timing.known(p.first) and timing.known(p.second)]
-    if not known:
+    timed = [p for p in t.pairs if timing.known(p.first) and timing.known(p.second)]
+    if not timed:
         return None
     return sign_flip_test(
-        [timing.time_within_horizon(p.first) - timing.time_within_horizon(p.second) for p in known],
+        [timing.time_within_horizon(p.first) - timing.time_within_horizon(p.second) for p in timed],
         timing.until,
     )
 
@@ -191,29 +191,31 @@ def _answer_chance(c: Comparison, test: ExactTest, context: AnswerContext) -> li
     return [("Could it be chance?", f"Barnard, two-sided, {fixed}", f"{p_words(test.p)}{corrected}")]
 
 
-def _answer_scenes(_: Comparison, found: Stratified, __: AnswerContext) -> list[Answer]:
-    ratio = "without bound" if found.odds_ratio is None else f"{found.odds_ratio:.2g}"
-    over = f"{signed_points(found.stratified)}, odds ratio {ratio}, p = {probability(found.p)}"
+def _answer_scenes(_: Comparison, effect: Stratified, __: AnswerContext) -> list[Answer]:
+    ratio = "without bound" if effect.odds_ratio is None else f"{effect.odds_ratio:.2g}"
+    over = f"{signed_points(effect.stratified)}, odds ratio {ratio}, p = {probability(effect.p)}"
     return [("Over scenes?", "Mantel-Haenszel", over)]
 
 
-def _answer_interaction(c: Comparison, found: Mapping[str, Difference], _: AnswerContext) -> list[Answer]:
-    by_scene = "; ".join(f"{name} {format_points(difference)}" for name, difference in found.items())
+def _answer_interaction(
+    c: Comparison, differences: Mapping[str, Difference], _: AnswerContext
+) -> list[Answer]:
+    by_scene = "; ".join(f"{name} {format_points(difference)}" for name, difference in differences.items())
     chance = "too many ways to count" if c.interaction is None else p_words(c.interaction)
-    words = by_scene if c.standing is Standing.OPEN else f"{chance}: {by_scene}"
-    return [("Does it depend on the scene?", "interaction, Zelen, exact", words)] if found else []
+    text = by_scene if c.standing is Standing.OPEN else f"{chance}: {by_scene}"
+    return [("Does it depend on the scene?", "interaction, Zelen, exact", text)] if differences else []
 
 
-def _answer_times(c: Comparison, found: SignFlipTest, _: AnswerContext) -> list[Answer]:
-    ahead = c.first if found.value < 0 else c.second
-    lead = f"{ahead} by {abs(found.value):.1f} s, failures counted in full" if found.value else "neither"
-    words = f"{lead}, {p_words(found.p)} of {found.pairs} pairs"
-    return [("Which is faster?", _EXCHANGEABLE, words)]
+def _answer_times(c: Comparison, test: SignFlipTest, _: AnswerContext) -> list[Answer]:
+    ahead = c.first if test.value < 0 else c.second
+    lead = f"{ahead} by {abs(test.value):.1f} s, failures counted in full" if test.value else "neither"
+    text = f"{lead}, {p_words(test.p)} of {test.pairs} pairs"
+    return [("Which is faster?", _EXCHANGEABLE, text)]
 
 
-def _answer_anytime(question: str, c: Comparison, found: Interval | None) -> list[Answer]:
+def _answer_anytime(question: str, c: Comparison, interval: Interval | None) -> list[Answer]:
     how = f"confidence sequence, {100 * (1 - c.alpha):.3g} %"
-    return [] if c.standing is Standing.OPEN else [(question, how, anytime_text(found, c.pairs))]
+    return [] if c.standing is Standing.OPEN else [(question, how, anytime_text(interval, c.pairs))]
 
 
 def _write_anytime(c: Comparison) -> dict[str, Any] | None:
@@ -393,14 +395,14 @@ _OF_DESIGN = {"success": "evidence", "score": "score_evidence"}  # statistic tha
 def compare(names: tuple[str, str], trials: ComparedTrials, verdict: Verdict | None) -> Comparison:
     """Return the comparison of two checkpoints; it is a planned one if its design has a `verdict` on it."""
     notes = _later(len(trials.pairs) - len(trials.evidence))
-    found = compute_all(Comparison, trials, notes)
+    statistics = compute_all(Comparison, trials, notes)
     notes += _unpaired(trials) if trials.in_pairs else [_RANDOM]
     standing = Standing.UNPLANNED if verdict is None else Standing.DECIDED if verdict.ended else Standing.OPEN
-    made = Comparison(*names, standing, trials.alpha, **found, notes=tuple(notes))
-    return made if verdict is None or verdict.ended else _described(made, verdict.evidence)
+    comparison = Comparison(*names, standing, trials.alpha, **statistics, notes=tuple(notes))
+    return comparison if verdict is None or verdict.ended else _described(comparison, verdict.evidence)
 
 
-def _described(found: Comparison, evidence: str) -> Comparison:
+def _described(comparison: Comparison, evidence: str) -> Comparison:
     """Return an open comparison with its descriptions only: statistics that infer are emptied.
 
     The statistic of `evidence`, if that is the design, also remains.
@@ -410,8 +412,10 @@ def _described(found: Comparison, evidence: str) -> Comparison:
         for name, row in statistics_of(Comparison).items()
         if not row.describes and name != _OF_DESIGN.get(evidence)
     )
-    empty: dict[str, Any] = {name: {} if isinstance(getattr(found, name), dict) else None for name in left}
-    return replace(found, **empty)
+    empty: dict[str, Any] = {
+        name: {} if isinstance(getattr(comparison, name), dict) else None for name in left
+    }
+    return replace(comparison, **empty)
 
 
 def _unpaired(trials: ComparedTrials) -> list[str]:

@@ -144,19 +144,21 @@ def all_attempts(plan: Plan, looks: Iterable[BenchImage]) -> list[AttemptRecord]
     own = ("status", "attempt", "operator__username", "station__name", "started_at", "ended_at")
     voided = ("reason", "voided_at", "voided_by__username")
     rows, accepted = plan.handouts.order_by("number"), _accepted(looks)
-    told = ("trial__setup_took", "trial__episode__policy", "trial__ended_by", "trial__episode__status")
-    found = []
+    end_fields = ("trial__setup_took", "trial__episode__policy", "trial__ended_by", "trial__episode__status")
+    attempts = []
     named = [f"trial__{name}" for name in (*own, *voided)]
-    for row in rows.values_list(*fields, *named, *told):
-        *plain, took, policy, kept, recording = row
+    for row in rows.values_list(*fields, *named, *end_fields):
+        *plain, took, policy, stored_end, recording = row
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
-        made = AttemptRecord(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays)
-        told_now = made.status == TrialStatus.VOIDED and kept is None  # its reason is a person's
-        found.append(
-            made if told_now else replace(made, ended=end_of(kept, made.status, made.reason or "", recording))
+        attempt = AttemptRecord(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays)
+        told_now = attempt.status == TrialStatus.VOIDED and stored_end is None  # its reason is a person's
+        attempts.append(
+            attempt
+            if told_now
+            else replace(attempt, ended=end_of(stored_end, attempt.status, attempt.reason or "", recording))
         )
-    return found
+    return attempts
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,15 +199,15 @@ def bench_images(plan: Plan) -> list[BenchImage]:
     ]
 
 
-def _accepted(looks: Iterable[BenchImage]) -> dict[int, tuple[float | None, str]]:
+def _accepted(images: Iterable[BenchImage]) -> dict[int, tuple[float | None, str]]:
     """Return by trial the smallest match of its last bench check, and the reason for which a low match was accepted."""
     newest: dict[int, dict[str, BenchImage]] = defaultdict(dict)
-    for look in looks:
-        newest[look.trial][look.camera] = look
+    for image in images:
+        newest[image.trial][image.camera] = image
     return {
         trial: (
-            min((look.match for look in cameras.values() if look.match is not None), default=None),
-            next((look.override for look in cameras.values() if look.override), ""),
+            min((image.match for image in cameras.values() if image.match is not None), default=None),
+            next((image.override for image in cameras.values() if image.override), ""),
         )
         for trial, cameras in newest.items()
     }
@@ -222,25 +224,25 @@ def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
     names = sorted({run.checkpoint for run in counted})
     for run in counted:
         counts[getattr(run, name)][run.checkpoint] += 1
-    trials = {who: [of[each] for each in names] for who, of in sorted(counts.items())}
-    of_all = [sum(made) for made in zip(*trials.values(), strict=True)]
+    trials = {group: [of[checkpoint] for checkpoint in names] for group, of in sorted(counts.items())}
+    of_all = [sum(numbers) for numbers in zip(*trials.values(), strict=True)]
     off = [
-        abs(count - sum(made) * all_ / len(counted))
-        for made in trials.values()
-        for count, all_ in zip(made, of_all, strict=True)
+        abs(count - sum(numbers) * all_ / len(counted))
+        for numbers in trials.values()
+        for count, all_ in zip(numbers, of_all, strict=True)
     ]
     uneven = round(max(off, default=0.0), 1)
-    rows = [{"name": who, "trials": made} for who, made in trials.items()]
+    rows = [{"name": group, "trials": numbers} for group, numbers in trials.items()]
     return {"checkpoints": names, "rows": rows, "uneven": uneven}
 
 
 def _checkpoints(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    again = Counter(run.checkpoint for run in runs if run.attempt > 1)
+    repeats = Counter(run.checkpoint for run in runs if run.attempt > 1)
     return [
         {
             **asdict(row),
             "voided": row.voided,
-            "repeated": again[row.checkpoint],
+            "repeated": repeats[row.checkpoint],
             "operators": sorted(row.operators),
             "stations": sorted(row.stations),
         }
@@ -250,12 +252,12 @@ def _checkpoints(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 
 def _voids(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
     """Return every void with its outcome: requested voids first, then voids that needed only one operator."""
-    known = {run.trial: run for run in runs}
-    asked = VoidRequest.objects.filter(trial__handout__plan=plan).order_by("pk")
+    by_trial = {run.trial: run for run in runs}
+    requests = VoidRequest.objects.filter(trial__handout__plan=plan).order_by("pk")
     fields = ("trial_id", "reason", "at", "answer", "answer_reason", "answered_at")
     rows = [
         {**row, "answer": row["answer"] or "not answered"}
-        for row in asked.values(
+        for row in requests.values(
             *fields, by_name=F("by__username"), answered_by_name=F("answered_by__username")
         )
     ]
@@ -273,7 +275,7 @@ def _voids(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
         if run.status == TrialStatus.VOIDED and run.trial not in granted
     ]
     return [
-        {**row, "code": known[row["trial_id"]].code, "checkpoint": known[row["trial_id"]].checkpoint}
+        {**row, "code": by_trial[row["trial_id"]].code, "checkpoint": by_trial[row["trial_id"]].checkpoint}
         for row in rows
     ]
 
@@ -303,18 +305,18 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 
     `changed` is "verdict", or "category" (of a failure) or "note" if the verdict is unchanged.
     """
-    known, found = {run.trial: run for run in runs}, []
+    by_trial, corrections = {run.trial: run for run in runs}, []
     scores = Score.objects.filter(trial__handout__plan=plan)
     for row in with_changes(scores, why=F("reason"), at=F("scored_at"), by_name=F("rater__username")):
-        earlier, run = row["earlier"], known[row["trial_id"]]
+        earlier, run = row["earlier"], by_trial[row["trial_id"]]
         late = bool(plan.stored_at and row["at"] > plan.stored_at)
         if earlier is None and not late:
             continue
-        told = {name: row[name] for name in ("trial_id", "success", "score", "at", "by_name", "changed")}
+        values = {name: row[name] for name in ("trial_id", "success", "score", "at", "by_name", "changed")}
         was = {"before": earlier and earlier["success"], "score_before": earlier and earlier["score"]}
-        found.append(
+        corrections.append(
             {
-                **told,
+                **values,
                 **was,
                 "reason": row["why"],
                 "late": late,
@@ -322,21 +324,23 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
                 "checkpoint": run.checkpoint,
             }
         )
-    return found
+    return corrections
 
 
 def _amendments(plan: Plan) -> list[dict[str, Any]]:
     """Return the earlier versions, newest first, preceded by the next version if there is one."""
-    found, version = [], plan
+    amendments, version = [], plan
     while version.amends is not None:
-        found.append(
+        amendments.append(
             {"version": version.version, "amends": version.amends.version, "because": version.amended_because}
         )
         version = version.amends
     later = Plan.objects.filter(amends=plan).first()
     if later is not None:
-        found.insert(0, {"version": later.version, "amends": plan.version, "because": later.amended_because})
-    return found
+        amendments.insert(
+            0, {"version": later.version, "amends": plan.version, "because": later.amended_because}
+        )
+    return amendments
 
 
 def _edits(plan: Plan) -> list[dict[str, Any]]:
@@ -353,8 +357,8 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
         action_time__gte=plan.frozen_at,
         action_time__lte=plan.stored_at or timezone.now(),
     )
-    found = list(rows.select_related("user", "content_type").order_by("action_time"))
-    if not found:
+    entries = list(rows.select_related("user", "content_type").order_by("action_time"))
+    if not entries:
         return []
     scenes = Scene.objects.filter(positions__plan=plan).distinct()
     called = {("scene", str(pk)): name for pk, name in scenes.values_list("pk", "name")}
@@ -366,7 +370,7 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
             "by_name": row.user.get_username(),
             "text": row.get_change_message(),
         }
-        for row in found
+        for row in entries
         if (name := called.get((row.content_type.model, row.object_id)))
     ]
 
@@ -415,13 +419,13 @@ def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
     """Return the codes of first attempts that came after a later slot at the same station."""
     reached: dict[str, int] = {}
     begun: set[int] = set()
-    found = []
+    codes = []
     for run in runs:
         if run.slot not in begun and run.slot < reached.get(run.station, -1):
-            found.append(run.code)
+            codes.append(run.code)
         begun.add(run.slot)
         reached[run.station] = max(reached.get(run.station, -1), run.slot)
-    return found
+    return codes
 
 
 def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
@@ -437,7 +441,7 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
             **{name: row[name] for name in ("at", "station_name", "by_name")},
             "cameras": len(row["seen"]),
             "match": min(
-                (seen["match"] for seen in row["seen"].values() if seen["match"] is not None), default=None
+                (view["match"] for view in row["seen"].values() if view["match"] is not None), default=None
             ),
         }
         for row in rows.values("at", "seen", station_name=F("station__name"), by_name=F("by__username"))
@@ -453,14 +457,14 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     return {"checks": checks, "unchecked": unchecked}
 
 
-def _bench(plan: Plan, runs: Iterable[AttemptRecord], looks: Iterable[BenchImage]) -> dict[str, Any]:
+def _bench(plan: Plan, runs: Iterable[AttemptRecord], images: Iterable[BenchImage]) -> dict[str, Any]:
     """Return the match gate of the plan, trials below it, trials without a known match, and replaced references."""
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []
     references: dict[tuple[str, str, int, str], set[int]] = defaultdict(set)
-    for look in looks:
-        if look.reference is not None:
-            references[look.place].add(look.reference)
+    for image in images:
+        if image.reference is not None:
+            references[image.place].add(image.reference)
     return {
         "gate": gate,
         "low": [
@@ -518,21 +522,21 @@ def _tested(
     values: Iterable[tuple[str, Sequence[tuple[int, str, float | None]]]], comparisons: Sequence[Names]
 ) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for name, told in values:
-        known = [(block, checkpoint, value) for block, checkpoint, value in told if value is not None]
-        if not known:
+    for name, triples in values:
+        measured = [(block, checkpoint, value) for block, checkpoint, value in triples if value is not None]
+        if not measured:
             continue
         arms: dict[str, list[float]] = defaultdict(list)
         blocks: dict[int, dict[str, float]] = defaultdict(dict)
-        for block, checkpoint, value in known:
+        for block, checkpoint, value in measured:
             arms[checkpoint].append(value)
             blocks[block][checkpoint] = value
         rows.append(
             {
                 "what": DELAYS[name],
                 "arms": [
-                    {"checkpoint": each, "n": len(of), "median": median(of), "longest": max(of)}
-                    for each, of in sorted(arms.items())
+                    {"checkpoint": arm, "n": len(of), "median": median(of), "longest": max(of)}
+                    for arm, of in sorted(arms.items())
                 ],
                 "tests": [_test(names, blocks.values()) for names in comparisons],
             }
@@ -547,7 +551,7 @@ def _tested(
 def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
     """Return the sign-flip test of the first checkpoint's values minus the second's, over the blocks that have both."""
     first, second = names
-    pairs = [found[first] - found[second] for found in blocks if first in found and second in found]
+    pairs = [values[first] - values[second] for values in blocks if first in values and second in values]
     widest = max(map(abs, pairs), default=0.0)
     test = sign_flip_test(pairs, widest) if widest else None
     return {
@@ -564,15 +568,15 @@ def _idle_gaps(runs: Iterable[AttemptRecord]) -> dict[int, float]:
     start [s].
     """
     ended: dict[str, datetime] = {}
-    found = {}
+    gaps = {}
     begun = [(run.started_at, run.number, run) for run in runs if run.started_at is not None]
     for started_at, _, run in sorted(begun, key=lambda row: row[:2]):
         gap = _seconds(ended.get(run.station), started_at)
         if gap is not None:
-            found[run.number] = gap
+            gaps[run.number] = gap
         if run.ended_at is not None:
             ended[run.station] = run.ended_at
-    return found
+    return gaps
 
 
 def _seconds(since: datetime | None, until: datetime | None) -> float | None:

@@ -28,17 +28,17 @@ def anchors_of(plan: Plan) -> list[dict[str, Any]]:
     this one, served the anchor in the same way, and is revealed or was never blind; of its trials those in scenes that
     are identical in this plan.
     """
-    found = []
+    anchors = []
     for row in (plan.document or {}).get("checkpoints", ()):
         if row.get("anchor"):
             own = _tried(row["name"], plan, {scene["name"] for scene in plan.document["scenes"]})
             before = [
-                each
-                for other in _earlier(plan, row)
-                for each in _tried(row["name"], other, _same_scenes(plan, other))
+                trial
+                for earlier in _earlier(plan, row)
+                for trial in _tried(row["name"], earlier, _same_scenes(plan, earlier))
             ]
             half = len(own) // 2
-            found.append(
+            anchors.append(
                 {
                     "checkpoint": row["name"],
                     "plans": list(_by_plan([*before, *own])),
@@ -46,35 +46,37 @@ def anchors_of(plan: Plan) -> list[dict[str, Any]]:
                     "within": _differ(own[:half], own[half:]),
                 }
             )
-    return found
+    return anchors
 
 
 def _earlier(plan: Plan, row: dict[str, Any]) -> list[Plan]:
     """Return earlier plans with the same anchor, served in the same way, that are not blind any more."""
-    told = Q(state=PlanState.REVEALED) | Q(blind=False, state=PlanState.CLOSED)
-    rows = Plan.objects.filter(told, frozen_at__lt=plan.frozen_at).exclude(pk=plan.pk)
+    visible = Q(state=PlanState.REVEALED) | Q(blind=False, state=PlanState.CLOSED)
+    rows = Plan.objects.filter(visible, frozen_at__lt=plan.frozen_at).exclude(pk=plan.pk)
     served = _served(plan, row)
     return [
-        other
-        for other in rows.order_by("frozen_at", "pk")
-        if any(_served(other, there) == served for there in (other.document or {})["checkpoints"])
+        earlier
+        for earlier in rows.order_by("frozen_at", "pk")
+        if any(
+            _served(earlier, checkpoint) == served for checkpoint in (earlier.document or {})["checkpoints"]
+        )
     ]
 
 
 def _served(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
     """Return the properties of an anchor on which its outcomes depend; labels are excluded."""
-    kept = {name: row.get(name) for name in ("name", "policy", "digest", "strategy")}
+    fields = {name: row.get(name) for name in ("name", "policy", "digest", "strategy")}
     document = plan.document or {}
-    return {**kept, "of_plan": document.get("strategy"), "counts_as": document.get("counts_as")}
+    return {**fields, "of_plan": document.get("strategy"), "counts_as": document.get("counts_as")}
 
 
-def _same_scenes(one: Plan, other: Plan) -> set[str]:
+def _same_scenes(first: Plan, second: Plan) -> set[str]:
     """Return the names of scenes that are identical in both plans: texts, milestones and time limits."""
-    ours, theirs = (
+    first_scenes, second_scenes = (
         {scene["name"]: {**scene, "positions": None} for scene in (plan.document or {})["scenes"]}
-        for plan in (one, other)
+        for plan in (first, second)
     )
-    return {name for name, scene in ours.items() if theirs.get(name) == scene}
+    return {name for name, scene in first_scenes.items() if second_scenes.get(name) == scene}
 
 
 def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
@@ -83,16 +85,16 @@ def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
     Of a revealed plan they have the scores at its reveal.
     """
     return [
-        _Tried(plan, (each.station, each.scene, each.position), each.success)
-        for each in load_plan_outcomes(plan)
-        if each.checkpoint == name and each.scene in scenes
+        _Tried(plan, (outcome.station, outcome.scene, outcome.position), outcome.success)
+        for outcome in load_plan_outcomes(plan)
+        if outcome.checkpoint == name and outcome.scene in scenes
     ]
 
 
 def _by_plan(rows: Iterable[_Tried]) -> Iterator[dict[str, Any]]:
     tried: dict[Plan, list[bool]] = defaultdict(list)
-    for each in rows:
-        tried[each.plan].append(each.success)
+    for trial in rows:
+        tried[trial.plan].append(trial.success)
     for plan, outcomes in sorted(tried.items(), key=lambda row: row[0].frozen_at):
         yield {
             "plan": plan.name,
@@ -108,11 +110,13 @@ def _differ(before: Sequence[_Tried], since: Sequence[_Tried]) -> float | None:
 
     None if no condition has trials of both groups.
     """
-    conditions = sorted({each.condition for each in (*before, *since)})
+    conditions = sorted({trial.condition for trial in (*before, *since)})
     tables = []
     for condition in conditions:
-        sides = [[each.success for each in rows if each.condition == condition] for rows in (before, since)]
-        (one, n), (other, m) = ((sum(side), len(side)) for side in sides)
+        sides = [
+            [trial.success for trial in rows if trial.condition == condition] for rows in (before, since)
+        ]
+        (successes, n), (successes_since, m) = ((sum(side), len(side)) for side in sides)
         if n and m:
-            tables.append(StratumTable(one, n, other, m))
+            tables.append(StratumTable(successes, n, successes_since, m))
     return exact_within(tables, least=1)

@@ -45,23 +45,23 @@ def parse_filter(given: Mapping[str, str], runs: Iterable[Outcome]) -> TrialFilt
     Raises:
         EvaError: If it names a value that the trials do not have.
     """
-    found = TrialFilter(
+    trial_filter = TrialFilter(
         **{name: given.get(name, "").strip() for name in ("scene", "position", "station", "operator")}
     )
-    known = filter_choices(runs)
-    for name, value in asdict(found).items():
-        if value and value not in known[name]:
-            raise EvaError(f"{name} = {value!r:.80}; allowed: {', '.join(known[name]) or 'none yet'}")
-    return found
+    choices = filter_choices(runs)
+    for name, value in asdict(trial_filter).items():
+        if value and value not in choices[name]:
+            raise EvaError(f"{name} = {value!r:.80}; allowed: {', '.join(choices[name]) or 'none yet'}")
+    return trial_filter
 
 
 def filter_choices(runs: Iterable[Outcome]) -> dict[str, list[str]]:
     """Return the values of each field that can be selected."""
-    given = list(runs)
-    positions = sorted({run.position for run in given})
+    outcomes = list(runs)
+    positions = sorted({run.position for run in outcomes})
     return {
-        "scene": sorted({run.scene for run in given}),
+        "scene": sorted({run.scene for run in outcomes}),
         "position": [str(number) for number in positions],
-        "station": sorted({run.station for run in given}),
-        "operator": sorted({run.operator for run in given}),
+        "station": sorted({run.station for run in outcomes}),
+        "operator": sorted({run.operator for run in outcomes}),
     }

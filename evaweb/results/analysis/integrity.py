@@ -56,13 +56,13 @@ class CheckpointChanges:
 
 def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
     """Return the changes of each checkpoint by name; the number of queries does not depend on the number of trials."""
-    found: dict[str, CheckpointChanges] = {}
+    by_checkpoint: dict[str, CheckpointChanges] = {}
     trials = Trial.objects.filter(handout__plan=plan).order_by("checkpoint__name")
     ends = ("ended_by", "status", "reason", "episode__status", "episode__frames")
     for name, status, success, operator, station, *end, frames in trials.values_list(
         "checkpoint__name", "status", "verdict__success", "operator__username", "station__name", *ends
     ):
-        row = found.setdefault(name, CheckpointChanges(name))
+        row = by_checkpoint.setdefault(name, CheckpointChanges(name))
         row.attempts += 1
         row.counted += status == TrialStatus.SCORED
         row.voided_successes += status == TrialStatus.VOIDED and success is True
@@ -83,11 +83,11 @@ def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
         earlier, success = score["earlier"], score["success"]
         if earlier is None:
             continue
-        row = found[score["name"]]
+        row = by_checkpoint[score["name"]]
         row.to_success += success and not earlier["success"]
         row.to_failure += earlier["success"] and not success
         row.late += score["changed"] == VERDICT and bool(plan.stored_at and score["at"] > plan.stored_at)
-    return list(found.values())
+    return list(by_checkpoint.values())
 
 
 def with_changes(scores: QuerySet[Score], **named: F) -> list[dict[str, Any]]:
@@ -122,9 +122,9 @@ def _outcomes(scores: QuerySet[Score]) -> dict[int, list[tuple[Any, ...]]]:
     """Return the milestone outcomes by score, for trials with more than one score."""
     corrected = scores.order_by().values("trial").annotate(n=Count("pk")).filter(n__gt=1).values("trial")
     rows = MilestoneOutcome.objects.filter(score__trial__in=corrected).order_by("order")
-    found: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+    by_score: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
     for score, *outcome in rows.values_list(
         "score", "order", "text", "points", "required", "reached", "at_s"
     ):
-        found[score].append(tuple(outcome))
-    return found
+        by_score[score].append(tuple(outcome))
+    return by_score

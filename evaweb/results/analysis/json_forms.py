@@ -34,7 +34,7 @@ def write_proportion(found: Proportion) -> dict[str, Any]:
 
 def write_proportions(found: Mapping[str, Proportion]) -> dict[str, Any]:
     """Return a dict of proportions as JSON, with the same keys."""
-    return {name: write_proportion(one) for name, one in found.items()}
+    return {name: write_proportion(rate) for name, rate in found.items()}
 
 
 def write_gaffke(found: BoundedMean | Difference) -> dict[str, Any]:

@@ -63,35 +63,35 @@ def _outcomes(
     rows = list(scored.values_list("verdict_id", "number", *_FIELDS.values()))
     earlier = {} if until is None else _scores_before(until, trials)
     milestones = _milestones(trials, earlier)
-    found = []
-    for at, (newest, number, *told) in enumerate(rows):
-        said = dict(zip(_FIELDS, told, strict=True))
+    outcomes = []
+    for at, (newest, number, *values) in enumerate(rows):
+        fields = dict(zip(_FIELDS, values, strict=True))
         verdict = newest
         if until is not None:
-            if said["trial"] not in earlier:
+            if fields["trial"] not in earlier:
                 continue
-            verdict, judged = earlier[said["trial"]]
-            same = said["success"] == judged["success"]  # the current cause may be more precise
-            said |= {name: value for name, value in judged.items() if not (same and name in FIELDS)}
+            verdict, judged = earlier[fields["trial"]]
+            same = fields["success"] == judged["success"]  # the current cause may be more precise
+            fields |= {name: value for name, value in judged.items() if not (same and name in FIELDS)}
         reached = milestones.get(verdict, [])
-        found.append(
+        outcomes.append(
             Outcome(
-                order=order.get(said["trial"], at),
-                block=blocks.get(said["trial"], f"{said['scene']}/{said['position']}/{number}"),
+                order=order.get(fields["trial"], at),
+                block=blocks.get(fields["trial"], f"{fields['scene']}/{fields['position']}/{number}"),
                 milestones=tuple(ok for _, ok in reached),
                 labels=tuple(text for text, _ in reached),
-                **said,
+                **fields,
             )
         )
-    return sorted(found, key=lambda outcome: outcome.order)
+    return sorted(outcomes, key=lambda outcome: outcome.order)
 
 
 def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[int, dict[str, Any]]]:
     """Return for each trial the key and values of its newest score given at or before `until`."""
-    given = Score.objects.filter(trial__in=trials, scored_at__lte=until).order_by("pk")
+    scores = Score.objects.filter(trial__in=trials, scored_at__lte=until).order_by("pk")
     return {
-        trial: (key, dict(zip(_JUDGED, said, strict=True)))
-        for trial, key, *said in given.values_list("trial_id", "pk", *_JUDGED)
+        trial: (key, dict(zip(_JUDGED, values, strict=True)))
+        for trial, key, *values in scores.values_list("trial_id", "pk", *_JUDGED)
     }
 
 
@@ -107,10 +107,10 @@ def _milestones(
         if earlier
         else MilestoneOutcome.objects.filter(score__in=trials.exclude(verdict=None).values("verdict"))
     )
-    found: dict[int, list[tuple[str, bool]]] = defaultdict(list)
+    by_score: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows: Iterable[tuple[int, str, bool]] = counting.order_by("score_id", "order").values_list(
         "score_id", "text", "reached"
     )
     for score, text, reached in rows:
-        found[score].append((text, reached))
-    return found
+        by_score[score].append((text, reached))
+    return by_score

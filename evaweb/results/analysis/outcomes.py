@@ -61,10 +61,10 @@ class Interruption:
 
 def by_checkpoint(outcomes: Iterable[Outcome]) -> dict[str, list[Outcome]]:
     """Return the outcomes by checkpoint, in the order of running."""
-    found: dict[str, list[Outcome]] = defaultdict(list)
+    outcomes_of: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in sorted(outcomes, key=lambda o: o.order):
-        found[outcome.checkpoint].append(outcome)
-    return dict(sorted(found.items()))
+        outcomes_of[outcome.checkpoint].append(outcome)
+    return dict(sorted(outcomes_of.items()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +81,13 @@ def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[P
     A block in which one of the checkpoints has no trial is skipped. Of several trials in one block only the last
     counts.
     """
-    others = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
-    ours = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
-    pairs = [Pair(outcome, others[block]) for block, outcome in ours.items() if block in others]
+    second_by_block = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
+    first_by_block = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
+    pairs = [
+        Pair(outcome, second_by_block[block])
+        for block, outcome in first_by_block.items()
+        if block in second_by_block
+    ]
     return sorted(pairs, key=_place)
 
 
@@ -107,10 +111,10 @@ def count_successes(trials: Sequence[Outcome]) -> tuple[int, int]:
 
 def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
     """Return the trials by key, sorted by it."""
-    found: dict[str, list[Outcome]] = defaultdict(list)
+    groups: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in trials:
-        found[key(outcome)].append(outcome)
-    return dict(sorted(found.items()))
+        groups[key(outcome)].append(outcome)
+    return dict(sorted(groups.items()))
 
 
 @dataclass(frozen=True, slots=True)

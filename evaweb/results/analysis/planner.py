@@ -79,7 +79,7 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
     Raises:
         EvaError: If a value is not allowed.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for field in fields(Question):
         text = given.get(field.name, "").strip()
         if not text:
@@ -87,7 +87,7 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
         if field.name == "comparing":
             if text not in COMPARISONS:
                 raise EvaError(_COMPARING_ALLOWED(text=text, comparisons=", ".join(COMPARISONS)))
-            found[field.name] = text
+            values[field.name] = text
             continue
         low, high = _ALLOWED[field.name]
         try:
@@ -96,8 +96,8 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
             value = None
         if value is None or not low <= value <= high:
             raise EvaError(_ALLOWED_2(name=field.name, text=text, low=low, high=high))
-        found[field.name] = value
-    question = Question(**found)
+        values[field.name] = value
+    question = Question(**values)
     if alike:
         return question
     if question.better == question.rate:
@@ -123,7 +123,7 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     tried = min(affordable, MOST)
     gains = tuple(gain for gain in _GAINS if q.rate + gain <= 1)
-    found: Outlook = computations.questions.result(
+    result: Outlook = computations.questions.result(
         person, outlook, q.rate, q.better, q.power, alpha, tried, gains, soon=soon
     )
     return {
@@ -132,13 +132,13 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
         "most": MOST,
         "designs": [
             design_for_power(q, rule, need, alone=comparisons == 1)
-            for rule, need in zip(RULES, found.needs, strict=True)
+            for rule, need in zip(RULES, result.needs, strict=True)
         ],
         "affordable": affordable,
         "tried": tried,
-        "chances": [asdict(one) for one in found.chances],
+        "chances": [asdict(chance) for chance in result.chances],
         "gains": [
-            {"gain": gain, "powers": list(powers)} for gain, powers in zip(gains, found.powers, strict=False)
+            {"gain": gain, "powers": list(powers)} for gain, powers in zip(gains, result.powers, strict=False)
         ],
         "detectable": detectable(affordable, q.rate, q.power, alpha) if affordable else None,
     }

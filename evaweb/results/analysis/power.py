@@ -54,15 +54,17 @@ class PowerRequest:
         """Designs that may be selected for this request, the selected one first."""
         if self.scores is not None:
             return (self.rule, *(rule for rule in score_courses.RULES if rule != self.rule))
-        others = (rule for rule in RULES if rule != self.rule and (self.margin is None or rule != ANYTIME))
-        return (self.rule, *others)
+        other_rules = (
+            rule for rule in RULES if rule != self.rule and (self.margin is None or rule != ANYTIME)
+        )
+        return (self.rule, *other_rules)
 
     @property
     def numbers(self) -> list[int]:
         """Numbers of trials per arm at which curves are computed, including the planned number."""
         end = min(MOST, max(_LEAST, round(1.6 * self.pairs)))
-        found = {max(2, round(end * step / _STEPS)) for step in range(1, _STEPS + 1)}
-        return sorted(found | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
+        numbers = {max(2, round(end * step / _STEPS)) for step in range(1, _STEPS + 1)}
+        return sorted(numbers | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
 
     def at(self, rule: str, pairs: int) -> DesignPower:
         """Return the power of a design with `pairs` pairs, whose looks are at the same shares of its trials as
@@ -70,8 +72,8 @@ class PowerRequest:
         """
         if self.scores is not None:
             return _computed(score_course, rule, pairs, self.scores, self.alpha)
-        looks = self.looks if rule == self.rule else ()
-        scaled = tuple(sorted({max(1, round(look * pairs / self.pairs)) for look in looks}))
+        interim_tests = self.looks if rule == self.rule else ()
+        scaled = tuple(sorted({max(1, round(number * pairs / self.pairs)) for number in interim_tests}))
         new, control = self.question.better, self.question.rate
         return _computed(design_power, rule, pairs, new, control, self.alpha, self.margin, scaled)
 
@@ -97,8 +99,8 @@ class Figures:
 
     def planned(self, asked: PowerRequest) -> dict[str, DesignPower]:
         """Return the power at the planned number of trials, by design."""
-        found = ((rule, one) for rule, curve in self.curves.items() for one in curve)
-        return {rule: one for rule, one in found if one.pairs == asked.pairs}
+        points = ((rule, point) for rule, curve in self.curves.items() for point in curve)
+        return {rule: point for rule, point in points if point.pairs == asked.pairs}
 
 
 def _computed(work: Callable[..., Any], *given: Any) -> Any:
@@ -112,38 +114,42 @@ def _computed(work: Callable[..., Any], *given: Any) -> Any:
 _Step = Callable[[Figures], Figures]
 
 
-def _steps(asked: PowerRequest) -> Iterator[_Step]:
+def _steps(request: PowerRequest) -> Iterator[_Step]:
     """Yield the computation's steps in the order of their importance for the page.
 
     That order is: the selected design, the other designs at the planned number, what each design needs, and the other
     designs' remaining points.
     """
-    planned = [asked.pairs] if asked.pairs in asked.numbers else []
-    yield from (_point(asked, asked.rule, number) for number in [*planned, *asked.numbers])
-    others = asked.rules[1:]
-    yield from (_point(asked, rule, number) for rule in others for number in planned)
-    if asked.margin is None:
-        yield from (_need(asked, rule) for rule in asked.rules)
-    yield from (_point(asked, rule, number) for rule in others for number in asked.numbers)
+    planned = [request.pairs] if request.pairs in request.numbers else []
+    yield from (_point(request, request.rule, number) for number in [*planned, *request.numbers])
+    other_rules = request.rules[1:]
+    yield from (_point(request, rule, number) for rule in other_rules for number in planned)
+    if request.margin is None:
+        yield from (_need(request, rule) for rule in request.rules)
+    yield from (_point(request, rule, number) for rule in other_rules for number in request.numbers)
 
 
-def _point(asked: PowerRequest, rule: str, number: int) -> _Step:
+def _point(request: PowerRequest, rule: str, number: int) -> _Step:
     def step(so_far: Figures) -> Figures:
-        found = {one.pairs: one for one in so_far.curves.get(rule, ())} | {number: asked.at(rule, number)}
-        curve = tuple(found[pairs] for pairs in sorted(found))
+        points = {point.pairs: point for point in so_far.curves.get(rule, ())} | {
+            number: request.at(rule, number)
+        }
+        curve = tuple(points[pairs] for pairs in sorted(points))
         return replace(so_far, curves={**so_far.curves, rule: curve})
 
     return step
 
 
-def _need(asked: PowerRequest, rule: str) -> _Step:
+def _need(request: PowerRequest, rule: str) -> _Step:
     def step(so_far: Figures) -> Figures:
-        question = asked.question
-        if asked.scores is None:
-            found = _computed(pairs_needed, rule, question.rate, question.better, question.power, asked.alpha)
+        question = request.question
+        if request.scores is None:
+            need = _computed(
+                pairs_needed, rule, question.rate, question.better, question.power, request.alpha
+            )
         else:
-            found = _computed(score_pairs_needed, rule, asked.scores, question.power, asked.alpha)
-        row = design_for_power(question, rule, found, alone=asked.alone)
+            need = _computed(score_pairs_needed, rule, request.scores, question.power, request.alpha)
+        row = design_for_power(question, rule, need, alone=request.alone)
         return replace(so_far, needs={**so_far.needs, rule: row})
 
     return step
@@ -174,34 +180,34 @@ class _Desk:
                 self._found.popitem(last=False)
             return self._found.get(asked, Figures())
 
-    def _wanted(self, asked: PowerRequest) -> bool:
+    def _wanted(self, request: PowerRequest) -> bool:
         since = time.monotonic() - _GIVEN_UP_S
-        self._newest = {who: row for who, row in self._newest.items() if row[1] > since}
-        return any(newest == asked for newest, _ in self._newest.values())
+        self._newest = {person: row for person, row in self._newest.items() if row[1] > since}
+        return any(newest == request for newest, _ in self._newest.values())
 
-    def _compute(self, asked: PowerRequest) -> None:
-        steps = list(_steps(asked))
+    def _compute(self, request: PowerRequest) -> None:
+        steps = list(_steps(request))
         for number, step in enumerate(steps, start=1):
             with self._changed:
-                so_far = self._found.get(asked)
-                if so_far is None or not self._wanted(asked):
-                    self._under_way.discard(asked)
+                so_far = self._found.get(request)
+                if so_far is None or not self._wanted(request):
+                    self._under_way.discard(request)
                     return
             if number <= so_far.done:  # computed before it was abandoned
                 continue
             try:
-                found = replace(step(so_far), done=number, of=len(steps))
+                figures = replace(step(so_far), done=number, of=len(steps))
             except StatisticsError as error:
-                found = replace(so_far, fault=str(error))
+                figures = replace(so_far, fault=str(error))
             except Exception:
-                log.exception("power of %s", asked)
-                found = replace(so_far, fault="it could not be computed: see the log of the web")
+                log.exception("power of %s", request)
+                figures = replace(so_far, fault="it could not be computed: see the log of the web")
             with self._changed:
-                self._found[asked] = found
+                self._found[request] = figures
                 self._changed.notify_all()
-                if found.whole:
-                    self._under_way.discard(asked)
-            if found.fault:
+                if figures.whole:
+                    self._under_way.discard(request)
+            if figures.fault:
                 return
 
 

@@ -30,8 +30,8 @@ def simulated_plans(plan: Plan) -> list[Plan]:
     """
     if is_simulated(plan) is not False:
         return []
-    there = Station.objects.filter(simulated=True)
-    rows = overlapping_plans(plan).filter(handouts__trial__station__in=there).distinct()
+    simulated_stations = Station.objects.filter(simulated=True)
+    rows = overlapping_plans(plan).filter(handouts__trial__station__in=simulated_stations).distinct()
     return [row for row in rows.select_related("owner") if is_simulated(row)]
 
 
@@ -41,12 +41,14 @@ def compare_with_real(real: Plan, simulated: Plan) -> dict[str, Any]:
 
     Trials are matched by checkpoint, scene and position, in order.
     """
-    ours, theirs = (by_checkpoint(cached_runs(plan).outcomes) for plan in (real, simulated))
-    shared = sorted(set(ours) & set(theirs))
-    rates = [(name, _rate(ours[name]), _rate(theirs[name])) for name in shared]
+    real_outcomes, simulated_outcomes = (
+        by_checkpoint(cached_runs(plan).outcomes) for plan in (real, simulated)
+    )
+    shared = sorted(set(real_outcomes) & set(simulated_outcomes))
+    rates = [(name, _rate(real_outcomes[name]), _rate(simulated_outcomes[name])) for name in shared]
     of_real, of_simulated = (
         [real.rate or 0.0 for _, real, _ in rates],
-        [found.rate or 0.0 for *_, found in rates],
+        [rate.rate or 0.0 for *_, rate in rates],
     )
     return {
         "plan": simulated,
@@ -58,7 +60,8 @@ def compare_with_real(real: Plan, simulated: Plan) -> dict[str, Any]:
                 first,
                 second,
                 powered_difference(
-                    _matched(ours[first], theirs[first]), _matched(ours[second], theirs[second])
+                    _matched(real_outcomes[first], simulated_outcomes[first]),
+                    _matched(real_outcomes[second], simulated_outcomes[second]),
                 ),
             )
             for first, second in compared(real.document or {})
@@ -72,24 +75,30 @@ def _rate(outcomes: Sequence[Outcome]) -> Proportion:
 
 
 def _matched(real: Sequence[Outcome], simulated: Sequence[Outcome]) -> Powered:
-    ours, theirs = _by_condition(real), _by_condition(simulated)
+    real_successes, simulated_successes = _by_condition(real), _by_condition(simulated)
     paired = [
         pair
-        for condition, rows in ours.items()
-        for pair in zip(rows, theirs.get(condition, []), strict=False)
+        for condition, rows in real_successes.items()
+        for pair in zip(rows, simulated_successes.get(condition, []), strict=False)
     ]
     # Unpaired trials have the same conditions in the same proportions: otherwise an easy condition would gain weight.
-    times = min((len(theirs.get(condition, [])) // len(rows) for condition, rows in ours.items()), default=0)
-    beside = [
+    times = min(
+        (
+            len(simulated_successes.get(condition, [])) // len(rows)
+            for condition, rows in real_successes.items()
+        ),
+        default=0,
+    )
+    extra = [
         value
-        for condition, rows in ours.items()
-        for value in theirs.get(condition, [])[len(rows) : times * len(rows)]
+        for condition, rows in real_successes.items()
+        for value in simulated_successes.get(condition, [])[len(rows) : times * len(rows)]
     ]
-    return Powered(paired, beside)
+    return Powered(paired, extra)
 
 
 def _by_condition(outcomes: Iterable[Outcome]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = defaultdict(list)
+    successes: dict[str, list[float]] = defaultdict(list)
     for outcome in outcomes:
-        found[outcome.condition].append(float(outcome.success))
-    return found
+        successes[outcome.condition].append(float(outcome.success))
+    return successes

@@ -73,7 +73,7 @@ def statistic(*declared: Any, **more: Any) -> Any:
 
 def statistics_of(kind: Any) -> dict[str, Statistic]:
     """Return the declarations in `Arm` or `Comparison` by the name of their field."""
-    return {each.name: each.metadata[_ROW] for each in fields(kind) if _ROW in each.metadata}
+    return {field.name: field.metadata[_ROW] for field in fields(kind) if _ROW in field.metadata}
 
 
 def compute_all(kind: Any, trials: Any, notes: list[str] | None = None) -> dict[str, Any]:
@@ -84,16 +84,16 @@ def compute_all(kind: Any, trials: Any, notes: list[str] | None = None) -> dict[
     Raises:
         StatisticsError: If one cannot be computed and there are no `notes`.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name, row in statistics_of(kind).items():
         try:
-            found[name] = row.compute(trials)
+            values[name] = row.compute(trials)
         except StatisticsError as error:
             if notes is None:
                 raise
-            found[name] = None
+            values[name] = None
             notes.append(str(error))
-    return found
+    return values
 
 
 def write_all(found: Any) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def probability(p: float) -> str:
 
 def p_words(p: float) -> str:
     """Return a p-value as text, for example "p = 0.03" or "p < 0.001"."""
-    return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
+    return f"p {text}" if (text := probability(p)).startswith("<") else f"p = {text}"
 
 
 def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:

@@ -21,12 +21,12 @@ class BenchTruth:
 
     def judge(self, case: TrialCase) -> CaseJudgement:
         """Return whether the bench reports each milestone as reached within its time."""
-        if all(known is None for known in case.truth):
+        if all(reached is None for reached in case.truth):
             raise NoVerdict("the bench reports none of its milestones")
         return CaseJudgement(
             tuple(
-                MilestoneJudgement() if known is None else MilestoneJudgement(known, float(known))
-                for known in case.truth
+                MilestoneJudgement() if reached is None else MilestoneJudgement(reached, float(reached))
+                for reached in case.truth
             )
         )
 

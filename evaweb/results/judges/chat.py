@@ -91,21 +91,21 @@ def endpoint_of(setup: Setup) -> Endpoint:
     Raises:
         EvaError: If the address is not allowed.
     """
-    given = setup.address
+    address = setup.address
     allowed = "allowed: https://HOST[:PORT]/PATH, such as https://judge.example.org/v1"
     try:
-        parts = urlsplit(given)
+        parts = urlsplit(address)
         port, host = parts.port, parts.hostname or ""
     except ValueError as error:
-        raise EvaError(f"address = {given!r:.200}: {error}; {allowed}") from None
+        raise EvaError(f"address = {address!r:.200}: {error}; {allowed}") from None
     odd = parts.query or parts.fragment or parts.username is not None or parts.password is not None
-    if parts.scheme not in ("http", "https") or odd or not re.fullmatch(r"[!-~]+", given) or not host:
-        raise EvaError(f"address = {given!r:.200}; {allowed}")
+    if parts.scheme not in ("http", "https") or odd or not re.fullmatch(r"[!-~]+", address) or not host:
+        raise EvaError(f"address = {address!r:.200}; {allowed}")
     if port == 0:
-        raise EvaError(_ADDRESS_PORT_0_ALLOWED_1(given=given))
+        raise EvaError(_ADDRESS_PORT_0_ALLOWED_1(given=address))
     secure = parts.scheme == "https"
     if not (secure or setup.plain or _on_this_machine(host)):
-        raise EvaError(_ADDRESS_PICTURES_WOULD_TRAVEL_FOR(given=given))
+        raise EvaError(_ADDRESS_PICTURES_WOULD_TRAVEL_FOR(given=address))
     return Endpoint(
         secure, host, port or (443 if secure else 80), f"{parts.path.rstrip('/')}/chat/completions"
     )
@@ -177,10 +177,10 @@ class ChatJudge:
         key = self._key()
         content = self._post(json.dumps(_request(case, self._setup.model)).encode(), key)
         try:
-            found = _read(content, len(case.steps))
+            judgement = _read(content, len(case.steps))
         except NoVerdict as none:
             raise NoVerdict(_without(key, str(none))) from None
-        return replace(found, model=_without(key, found.model))
+        return replace(judgement, model=_without(key, judgement.model))
 
     def _key(self) -> str:
         name = self._setup.key_variable
@@ -244,17 +244,19 @@ class _Deadline:
         Raises:
             TimeoutError: If the deadline is over.
         """
-        made = socket.create_connection((at.host, at.port), min(self.wait, _CONNECT_S))
-        made.settimeout(self.wait)
-        self._socket = made
+        connection = socket.create_connection((at.host, at.port), min(self.wait, _CONNECT_S))
+        connection.settimeout(self.wait)
+        self._socket = connection
         if at.secure:
             context = ssl.create_default_context()
-            made = context.wrap_socket(made, server_hostname=at.host, do_handshake_on_connect=False)
-            self._socket = made
-            made.do_handshake()
+            connection = context.wrap_socket(
+                connection, server_hostname=at.host, do_handshake_on_connect=False
+            )
+            self._socket = connection
+            connection.do_handshake()
         if self.over:
             raise TimeoutError
-        return made
+        return connection
 
     def _cut(self) -> None:
         self.over = True
@@ -287,14 +289,14 @@ def _question(case: TrialCase) -> str:
 
 
 def _request(case: TrialCase, model: str) -> dict[str, Any]:
-    shown = [part for still in case.stills for part in _parts(still)]
+    pictures = [part for still in case.stills for part in _parts(still)]
     return {
         "model": model,
         "temperature": 0,
         "response_format": {"type": "json_object"},
         "messages": [
             {"role": "system", "content": _HOW},
-            {"role": "user", "content": [{"type": "text", "text": _question(case)}, *shown]},
+            {"role": "user", "content": [{"type": "text", "text": _question(case)}, *pictures]},
         ],
     }
 

@@ -74,8 +74,8 @@ class Size:
     def of(cls, plan: Plan) -> Size:
         """Return the size of a draft."""
         positions, checkpoints = plan.positions.count(), plan.checkpoints.count()
-        each = positions * plan.repetitions
-        return cls(positions, checkpoints, each, each * checkpoints)
+        per_checkpoint = positions * plan.repetitions
+        return cls(positions, checkpoints, per_checkpoint, per_checkpoint * checkpoints)
 
 
 def state_page(
@@ -90,9 +90,9 @@ def state_page(
         agreed: Whether the page shows exactly what is saved.
         cycle_s: Assumed duration of a trial [s].
     """
-    said = covered(plan, sight)
-    inway = [Remark(row.step, said(row.text)) for row in problems(plan)]
-    considered = [Remark(row.step, said(row.text)) for row in thoughts(plan)]
+    cover = covered(plan, sight)
+    inway = [Remark(row.step, cover(row.text)) for row in problems(plan)]
+    considered = [Remark(row.step, cover(row.text)) for row in thoughts(plan)]
     size = Size.of(plan)
     return {
         "plan": plan,
@@ -103,7 +103,7 @@ def state_page(
         "cycle_s": cycle_s,
         "hours": size.total * cycle_s / 3600,
         "preview": _preview(plan, size) if not inway else None,
-        "summary": list(_summary(plan, size, said, cycle_s)) if not inway else (),
+        "summary": list(_summary(plan, size, cover, cycle_s)) if not inway else (),
         "freezable": not inway and not faults and agreed,
     }
 
@@ -124,19 +124,19 @@ def _steps(
             return not inway, "not yet known"
         if name == "checks":
             n = len(inway)
-            words = f"{n} to fix" if n else f"{len(considered)} to consider"
-            return not inway and not considered, words
+            label = f"{n} to fix" if n else f"{len(considered)} to consider"
+            return not inway and not considered, label
         if name == "freeze":
             return False, "ready to freeze" if not inway and not faults and agreed else "not yet"
         return True, ""
 
     rows = []
     for name, title in STEPS.items():
-        done, words = own(name)
+        complete, label = own(name)
         if missing[name]:
-            done, words = False, f"{missing[name]} to fix" if name not in first else _short(first[name])
+            complete, label = False, f"{missing[name]} to fix" if name not in first else _short(first[name])
         blocks = bool(missing[name]) or (name in ("schedule", "checks") and bool(inway))
-        rows.append(Step(name, title, done, "" if done else words, blocks))
+        rows.append(Step(name, title, complete, "" if complete else label, blocks))
     return rows
 
 
@@ -144,7 +144,7 @@ _SHORT = {"has no position": "no position yet", "has no checkpoint": "no checkpo
 
 
 def _short(text: str) -> str:
-    return next((words for part, words in _SHORT.items() if part in text), "to mend")
+    return next((label for part, label in _SHORT.items() if part in text), "to mend")
 
 
 _FIELDS = {
@@ -158,13 +158,15 @@ def _step_of(field: str) -> str:
     return next((step for step, fields in _FIELDS.items() if field in fields), "design")
 
 
-def _summary(plan: Plan, size: Size, said: Callable[[str], str], cycle_s: float) -> Iterator[tuple[str, str]]:
+def _summary(
+    plan: Plan, size: Size, cover: Callable[[str], str], cycle_s: float
+) -> Iterator[tuple[str, str]]:
     """Yield the properties of the plan that a freeze asks to confirm."""
     names = plan.checkpoints.order_by("name").values_list("name", flat=True)
     pairs = [f"{first} with {second}" for first, second in planned(plan)]
     scenes = plan.positions.values("scene").distinct().count()
-    yield "Checkpoints", said(", ".join(names))
-    yield "Compared", said("; ".join(pairs)) or "nothing: no comparison is chosen"
+    yield "Checkpoints", cover(", ".join(names))
+    yield "Compared", cover("; ".join(pairs)) or "nothing: no comparison is chosen"
     yield "Positions", f"{size.positions} of {scenes} scene{'s' if scenes > 1 else ''}"
     hours = size.total * cycle_s / 3600
     yield "Trials", f"{size.each} of each checkpoint, {size.total} in all: {hours:.1f} robot hours"
@@ -214,9 +216,9 @@ def choices_page(plan: Plan, sight: Visibility, values: Values) -> dict[str, Any
     chosen = set(values["checkpoints"])
     offered = list(checkpoint_list(all_of_them=True, sight=sight))
     positions = Position.objects.select_related("scene").order_by("scene__title", "number")
-    wanted = [row for row in positions if row.scene.active or row.pk in values["positions"]]
-    pictures = _pictures(wanted)
-    scenes = groupby(wanted, key=lambda row: row.scene)
+    listed = [row for row in positions if row.scene.active or row.pk in values["positions"]]
+    pictures = _pictures(listed)
+    scenes = groupby(listed, key=lambda row: row.scene)
     stations = Station.objects.order_by("name")
     return {
         "values": values,
@@ -269,10 +271,10 @@ def value_text(name: str, value: Any, sight: Visibility) -> str:
 def _pictures(positions: Iterable[Position]) -> dict[int, str]:
     """Return for each position the newest reference image of the first camera that has one."""
     rows = Reference.objects.filter(position__in=list(positions)).order_by("camera", "-pk")
-    found: dict[int, str] = {}
+    pictures: dict[int, str] = {}
     for position, picture in rows.values_list("position", "picture"):
-        found.setdefault(position, picture)
-    return found
+        pictures.setdefault(position, picture)
+    return pictures
 
 
 def power_request(plan: Plan, question: Question, spread: float) -> PowerRequest | None:
@@ -283,21 +285,21 @@ def power_request(plan: Plan, question: Question, spread: float) -> PowerRequest
     comparisons, size = len(planned(plan)), Size.of(plan)
     if not comparisons or not size.each:
         return None
-    looks = tuple(plan.look_after)
+    interim_tests = tuple(plan.look_after)
     share = plan.alpha / comparisons
     scores = None
     if plan.outcome == PrimaryOutcome.SCORE:
         scores = Scores(question.better, question.rate, spread, _points(plan))
     return PowerRequest(
-        plan.stopping, size.each, share, plan.margin, looks, question, comparisons == 1, scores
+        plan.stopping, size.each, share, plan.margin, interim_tests, question, comparisons == 1, scores
     )
 
 
 def _points(plan: Plan) -> int:
     """Return the number of points of a score at the draft's scene with the fewest; 1 means success or failure only."""
     scenes = Scene.objects.filter(positions__in=plan.positions.all()).distinct()
-    found = [sum(scene.milestones.values_list("points", flat=True)) or 1 for scene in scenes]
-    return min([LARGEST, *found])
+    points = [sum(scene.milestones.values_list("points", flat=True)) or 1 for scene in scenes]
+    return min([LARGEST, *points])
 
 
 def question_for(plan: Plan, given: Question) -> Question:
@@ -321,7 +323,7 @@ def power_page(plan: Plan, asked: PowerRequest, found: Figures) -> dict[str, Any
     size, question = Size.of(plan), asked.question
     at = found.planned(asked)
     curves = [
-        (RULES.index(rule), design_text(rule), [(one.pairs, one.power) for one in found.curves[rule]])
+        (RULES.index(rule), design_text(rule), [(point.pairs, point.power) for point in found.curves[rule]])
         for rule in RULES
         if rule in found.curves and (len(found.curves[rule]) > 1 or rule in at)
     ]
@@ -351,7 +353,7 @@ def power_page(plan: Plan, asked: PowerRequest, found: Figures) -> dict[str, Any
         "stations": question.stations,
         "scores": asked.scores,
         "narrowed": asked.scores is not None
-        and any(abs(one - asked.scores.spread) > 0.005 for one in asked.scores.spreads()),
+        and any(abs(point - asked.scores.spread) > 0.005 for point in asked.scores.spreads()),
         "random": plan.allocation == Allocation.RANDOM,
         "comparisons": len(planned(plan)),
     }

@@ -65,7 +65,7 @@ def summary_page(result: PlanResult) -> dict[str, Any]:
 def _summary(result: PlanResult, order: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     plan, only, analysis = result.plan, result.only, result.analysis
     outcomes, primaries = result.runs.outcomes, result.primaries
-    facts = [comparison_facts(result, found) for found in primaries]
+    facts = [comparison_facts(result, comparison) for comparison in primaries]
     scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
     return {
         "analysis": analysis,
@@ -80,9 +80,9 @@ def _summary(result: PlanResult, order: Mapping[str, tuple[str, ...]]) -> dict[s
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
         "scenes": [(scene, scene_rows(result, scene)) for scene in scenes],
         "others": [
-            (found, comparison_sentence(analysis, found), compare_address(plan, found, only))
-            for found in analysis.comparisons
-            if found not in primaries
+            (comparison, comparison_sentence(analysis, comparison), compare_address(plan, comparison, only))
+            for comparison in analysis.comparisons
+            if comparison not in primaries
         ],
         "missed": [undetectable_text(analysis)] if analysis.arms else [],
         "changes": checkpoint_changes(plan),
@@ -105,26 +105,28 @@ def _compared(result: PlanResult, first: str, second: str) -> dict[str, Any]:
     primaries = result.primaries
     if not first and not second and primaries:
         first, second = primaries[0].first, primaries[0].second
-    found = analysis.comparison_of(first, second)
-    if found is None:
+    comparison = analysis.comparison_of(first, second)
+    if comparison is None:
         raise EvaError(
             _NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=", ".join(names) or "none")
         )
-    arms = (analysis.arm(found.first), analysis.arm(found.second))
+    arms = (analysis.arm(comparison.first), analysis.arm(comparison.second))
     runs = by_checkpoint(only.apply(result.runs.outcomes))
     return {
         "analysis": analysis,
         "only": only,
-        "found": found,
+        "found": comparison,
         "names": names,
-        "facts": comparison_facts(result, found),
-        "difference": rates.draw_difference(found),
+        "facts": comparison_facts(result, comparison),
+        "difference": rates.draw_difference(comparison),
         **draw_arms(arms, analysis.letters, partial(trials_address, plan, only)),
-        "evidence": found.evidence
+        "evidence": comparison.evidence
         and time_courses.draw_evidence(
-            found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
+            comparison.evidence, comparison.first, comparison.second, drawn=(arms[0].series, arms[1].series)
         ),
-        "paired": list(enumerate(pair_by_block(runs.get(found.first, []), runs.get(found.second, [])), 1)),
+        "paired": list(
+            enumerate(pair_by_block(runs.get(comparison.first, []), runs.get(comparison.second, [])), 1)
+        ),
     }
 
 
@@ -169,37 +171,37 @@ def evidence_page(result: PlanResult) -> dict[str, Any]:
 
 
 def _evidence(result: PlanResult) -> dict[str, Any]:
-    analysis, found, design = result.analysis, result.primaries, result.design
-    if not found or design is None:
+    analysis, primaries, design = result.analysis, result.primaries, result.design
+    if not primaries or design is None:
         return {"meters": [], "compared": design is not None}
     return {
         "headline": result.headline,
-        "meters": [_meter(analysis, one, design) for one in found],
+        "meters": [_meter(analysis, comparison, design) for comparison in primaries],
         "missed": undetectable_text(analysis),
     }
 
 
-def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, Any]:
-    names = (found.first, found.second)
-    drawn = (analysis.arm(found.first).series, analysis.arm(found.second).series)
+def _meter(analysis: Analysis, comparison: Comparison, design: Design) -> dict[str, Any]:
+    names = (comparison.first, comparison.second)
+    drawn = (analysis.arm(comparison.first).series, analysis.arm(comparison.second).series)
     return {
-        "found": found,
+        "found": comparison,
         "foreseen": design.blocks,
         "by": [
             (
-                what,
+                label,
                 time_courses.draw_evidence(evidence, *names, design.blocks, drawn),
                 evidence_text(evidence),
             )
-            for what, evidence in (
-                ("By success and failure", found.evidence),
-                ("By scores, partial credit included", found.score_evidence),
+            for label, evidence in (
+                ("By success and failure", comparison.evidence),
+                ("By scores, partial credit included", comparison.score_evidence),
             )
             if evidence
         ],
-        "open": found.standing is Standing.OPEN,
-        "difference": anytime_text(found.anytime, found.pairs),
-        "score_difference": anytime_text(found.score_anytime, found.pairs),
+        "open": comparison.standing is Standing.OPEN,
+        "difference": anytime_text(comparison.anytime, comparison.pairs),
+        "score_difference": anytime_text(comparison.score_anytime, comparison.pairs),
         "level": 100 * (1 - design.share),
         "wanted": 2 / design.share,
     }

@@ -54,10 +54,10 @@ MOST_PICTURES = (
 def plans(request: HttpRequest) -> HttpResponseBase:
     """Render all plans with their progress."""
     listing = Listing(request.GET, listings.PLAN_COLUMNS, listings.PLAN_FILTERS)
-    found = selectors.plan_list(**listing.chosen)
+    rows = selectors.plan_list(**listing.chosen)
     if listing.wants_file:
-        return listing.file(request, "evaluations", selectors.plan_rows(listing.ordered(found)))
-    page = listing.page(found, PLANS_PER_PAGE)
+        return listing.file(request, "evaluations", selectors.plan_rows(listing.ordered(rows)))
+    page = listing.page(rows, PLANS_PER_PAGE)
     context = {
         "listing": listing,
         "page": page,
@@ -77,27 +77,27 @@ def plan(request: HttpRequest, name: str, version: int | None = None) -> HttpRes
 @require_GET
 def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Render the comparison of two checkpoints."""
-    found = _get_plan(name, version)
-    sealed = _sealed_page(request, found)
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
     if sealed:
         return sealed
     try:
-        result = PlanResult(found).select(request.GET)
+        result = PlanResult(plan).select(request.GET)
         context = pages.comparison_page(result, request.GET.get("first", ""), request.GET.get("second", ""))
         context |= pages.pairs_shown(context, pages.pair_view(request.GET))
     except EvaError as fault:
-        return _plan_page(request, found, fault)
-    return render(request, "results/compare.html", {**context, **_common(request, found)})
+        return _plan_page(request, plan, fault)
+    return render(request, "results/compare.html", {**context, **_common(request, plan)})
 
 
 @require_GET
 def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Render the evidence so far, for users who may see it; with HX-Request only the meter as a fragment."""
-    found = _get_plan(name, version)
-    sealed = _sealed_page(request, found)
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
     if sealed:
         return sealed
-    context = {**pages.evidence_page(PlanResult(found)), **_common(request, found)}
+    context = {**pages.evidence_page(PlanResult(plan)), **_common(request, plan)}
     fragment = bool(request.headers.get("HX-Request"))
     return render(request, "results/meter.html" if fragment else "results/evidence.html", context)
 
@@ -105,27 +105,27 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
     """Render the list of the plan's trials that the filters in the address select."""
-    found = _get_plan(name, version)
-    sealed = _sealed_page(request, found)
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
     if sealed:
         return sealed
     listing = Listing(
-        request.GET, listings.TRIAL_COLUMNS, listings.trial_filters(PlanResult(found).runs.outcomes)
+        request.GET, listings.TRIAL_COLUMNS, listings.trial_filters(PlanResult(plan).runs.outcomes)
     )
     try:
-        rows = selectors.trials_of_plan(found, listings.question_of(listing.chosen))
+        rows = selectors.trials_of_plan(plan, listings.question_of(listing.chosen))
     except EvaError as fault:
-        return _plan_page(request, found, fault)
+        return _plan_page(request, plan, fault)
     rows = rows.prefetch_related("verdict__outcomes")
     if listing.wants_file:
-        return listing.file(request, f"{found.name}-v{found.version}-trials", rows)
+        return listing.file(request, f"{plan.name}-v{plan.version}-trials", rows)
     page = listing.page(rows, PER_PAGE)
     context = {
         "listing": listing,
         "page": page,
         "rows": [listings.trial_row(trial) for trial in page],
-        "declared": declared_failures(found),
-        **_common(request, found),
+        "declared": declared_failures(plan),
+        **_common(request, plan),
     }
     return render(request, "results/trials.html", context)
 
@@ -133,11 +133,11 @@ def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
 @require_GET
 def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Return the offline report as a zip archive."""
-    found = _get_plan(name, version)
-    require_visible_results(found, request.user)
-    title = f"{found.name}-v{found.version}"
+    plan = _get_plan(name, version)
+    require_visible_results(plan, request.user)
+    title = f"{plan.name}-v{plan.version}"
     with TemporaryDirectory() as folder:
-        write_report(found, Path(folder) / title, most_pictures=MOST_PICTURES)
+        write_report(plan, Path(folder) / title, most_pictures=MOST_PICTURES)
         packed = shutil.make_archive(f"{folder}/packed", "zip", folder, title)
         content = Path(packed).read_bytes()
     return HttpResponse(
@@ -150,17 +150,17 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Render how the trials were made, and the alternative headlines."""
-    found = _get_plan(name, version)
-    sealed = _sealed_page(request, found)
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
     if sealed:
         return sealed
-    record = integrity_document(found)
+    record = integrity_document(plan)
     context = {
         "record": record,
         "banner": delays_banner(record),
         "too_few": too_few_text(record),
         "most": MOST_LINES,
-        **_common(request, found),
+        **_common(request, plan),
     }
     return render(request, "results/conduct.html", context)
 
@@ -168,15 +168,15 @@ def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Render related evaluations on simulated benches next to this plan."""
-    found = _get_plan(name, version)
-    sealed = _sealed_page(request, found)
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
     if sealed:
         return sealed
-    others = [row for row in simulated_plans(found) if not sealed_reason(row, request.user)]
+    visible = [row for row in simulated_plans(plan) if not sealed_reason(row, request.user)]
     context = {
-        "beside": [compare_with_real(found, row) for row in others],
-        "real": is_simulated(found),
-        **_common(request, found),
+        "beside": [compare_with_real(plan, row) for row in visible],
+        "real": is_simulated(plan),
+        **_common(request, plan),
     }
     return render(request, "results/simulated.html", context)
 
@@ -184,34 +184,34 @@ def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Render the citation of a plan; redirect to the permanent address of its result if it is revealed."""
-    found = _get_plan(name, version)
-    sealed = _sealed_page(request, found)
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
     if sealed:
         return sealed
-    if found.at_reveal and compared(found.document or {}):
-        return redirect("result-frozen", digest=found.at_reveal["digest"])
+    if plan.at_reveal and compared(plan.document or {}):
+        return redirect("result-frozen", digest=plan.at_reveal["digest"])
     try:
-        return _citation_page(request, citation(found))
+        return _citation_page(request, citation(plan))
     except EvaError as fault:
-        return _plan_page(request, found, fault)
+        return _plan_page(request, plan, fault)
 
 
 @require_GET
 def frozen(request: HttpRequest, digest: str) -> HttpResponse:
     """Render the result as recorded at its reveal; later corrections do not change it."""
-    found = selectors.plan_at_reveal(digest)
-    sealed = _sealed_page(request, found)
-    return sealed or _citation_page(request, citation(found))
+    plan = selectors.plan_at_reveal(digest)
+    sealed = _sealed_page(request, plan)
+    return sealed or _citation_page(request, citation(plan))
 
 
 @require_GET
 def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
     """Return the recorded result as a file: "txt", "tex" or "svg"."""
-    found = selectors.plan_at_reveal(digest)
-    require_visible_results(found, request.user)
-    title = f"{found.name}-v{found.version}-{digest[:8]}.{form}"
+    plan = selectors.plan_at_reveal(digest)
+    require_visible_results(plan, request.user)
+    title = f"{plan.name}-v{plan.version}-{digest[:8]}.{form}"
     return HttpResponse(
-        citation(found).render(form),
+        citation(plan).render(form),
         content_type=f"{_FORMS[form]}; charset=utf-8",
         headers={"Content-Disposition": f'attachment; filename="{title}"'},
     )
@@ -220,23 +220,23 @@ def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
 @require_POST
 def plan_action(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
     """Freeze, amend, close, reveal or unblind a plan, or have it judged; `what` names the action."""
-    found = _get_plan(name, version)
+    plan = _get_plan(name, version)
     user: Any = request.user
     reason = request.POST.get("reason", "")
     acts: Mapping[str, Callable[[], object]] = {
-        "freeze": lambda: services.freeze_plan(user=user, plan=found, seen=request.POST.get("seen", "")),
-        "amend": lambda: services.amend_plan(user=user, plan=found, reason=reason),
-        "close": lambda: services.close_plan(user=user, plan=found, reason=reason),
-        "reveal": lambda: services.reveal_plan(user=user, plan=found),
-        "look": lambda: record_unblinding(found, user),
-        "judge": lambda: request_judging(user=user, plan=found, name=request.POST.get("judge", "")),
+        "freeze": lambda: services.freeze_plan(user=user, plan=plan, seen=request.POST.get("seen", "")),
+        "amend": lambda: services.amend_plan(user=user, plan=plan, reason=reason),
+        "close": lambda: services.close_plan(user=user, plan=plan, reason=reason),
+        "reveal": lambda: services.reveal_plan(user=user, plan=plan),
+        "look": lambda: record_unblinding(plan, user),
+        "judge": lambda: request_judging(user=user, plan=plan, name=request.POST.get("judge", "")),
     }
     try:
-        made = acts[what]()
+        result = acts[what]()
     except EvaError as fault:
-        return _plan_page(request, found, fault, typed=reason)
-    shown = made if isinstance(made, Plan) else found
-    return redirect("result-plan", name=shown.name, version=shown.version)
+        return _plan_page(request, plan, fault, typed=reason)
+    target = result if isinstance(result, Plan) else plan
+    return redirect("result-plan", name=target.name, version=target.version)
 
 
 def _citation_page(request: HttpRequest, cited: Citation) -> HttpResponse:
@@ -266,12 +266,12 @@ def _get_plan(name: str, version: int | None) -> Plan:
 
 
 def _plan_page(
-    request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
+    request: HttpRequest, plan: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse:
-    sealed = _sealed_page(request, found, fault, typed)
+    sealed = _sealed_page(request, plan, fault, typed)
     if sealed:
         return sealed
-    result = PlanResult(found)
+    result = PlanResult(plan)
     try:
         result = result.select(request.GET)
     except EvaError as problem:
@@ -283,7 +283,7 @@ def _plan_page(
         "agreement": result.agreement,
         "judges": result.judges,
         "preferences": result.preferences,
-        **_common(request, found),
+        **_common(request, plan),
         "fault": fault,
         "typed": typed,
     }
@@ -291,37 +291,37 @@ def _plan_page(
 
 
 def _sealed_page(
-    request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
+    request: HttpRequest, plan: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse | None:
     """Return the page that replaces the results if they are sealed for this user or do not exist yet; else None."""
-    why = sealed_reason(found, request.user, visibility_for_request(request)) if has_results(found) else ""
-    if has_results(found) and not why:
+    reason = sealed_reason(plan, request.user, visibility_for_request(request)) if has_results(plan) else ""
+    if has_results(plan) and not reason:
         return None
     context = {
-        **_common(request, found),
-        "why": why,
+        **_common(request, plan),
+        "why": reason,
         "others": [
-            (plan, can_unblind(plan, request.user))
-            for plan in sealing_plans(found, request.user, visibility_for_request(request))
+            (sealing, can_unblind(sealing, request.user))
+            for sealing in sealing_plans(plan, request.user, visibility_for_request(request))
         ],
-        "may_look": found.sealed and can_unblind(found, request.user),
+        "may_look": plan.sealed and can_unblind(plan, request.user),
         "fault": fault,
         "typed": typed,
     }
     return render(request, "results/sealed.html", context, status=fault.status if fault else 200)
 
 
-def _common(request: HttpRequest, found: Plan) -> dict[str, Any]:
+def _common(request: HttpRequest, plan: Plan) -> dict[str, Any]:
     role = role_of(request.user)
-    managed = role is Role.ADMIN or (found.owner_id == request.user.pk and role is not Role.VIEWER)
+    managed = role is Role.ADMIN or (plan.owner_id == request.user.pk and role is not Role.VIEWER)
     return {
-        "plan": found,
-        "row": selectors.plan_rows([found])[0],
-        "events": found.events.select_related("by"),
-        "key": bytes(found.key or b"").hex() if found.state == PlanState.REVEALED else "",
+        "plan": plan,
+        "row": selectors.plan_rows([plan])[0],
+        "events": plan.events.select_related("by"),
+        "key": bytes(plan.key or b"").hex() if plan.state == PlanState.REVEALED else "",
         "may_manage": managed,
-        "voids": open_void_requests(Trial.objects.filter(handout__plan=found)),
-        "judges_ready": judges_ready() if managed and has_results(found) else [],
+        "voids": open_void_requests(Trial.objects.filter(handout__plan=plan)),
+        "judges_ready": judges_ready() if managed and has_results(plan) else [],
         "here": "plans",
-        "home": reverse("result-plan", args=[found.name, found.version]),
+        "home": reverse("result-plan", args=[plan.name, plan.version]),
     }

@@ -63,20 +63,20 @@ def new(request: HttpRequest) -> HttpResponse:
     """
     user: Any = request.user
     require_drafter(user)
-    given = request.POST if request.method == "POST" else request.GET
-    title, question, fault = given.get("title", ""), given.get("question", ""), None
+    values = request.POST if request.method == "POST" else request.GET
+    title, question, fault = values.get("title", ""), values.get("question", ""), None
     numbers = {
-        name: given[name]
+        name: values[name]
         for name in (*_CARRIED, "alpha", "comparing", "stopping")
-        if given.get(name, "").strip()
+        if values.get(name, "").strip()
     }
     try:
         assumed = question_of(numbers)
         design = _design(numbers, assumed)
         if request.method == "POST":
-            made = plan_draft(user=user, title=title, question=question, **design)
+            plan = plan_draft(user=user, title=title, question=question, **design)
             query = "&".join(f"{name}={getattr(assumed, name):g}" for name in _CARRIED if name in numbers)
-            return redirect(_address(made) + (f"?{query}" if query else "") + "#arms")
+            return redirect(_address(plan) + (f"?{query}" if query else "") + "#arms")
     except EvaError as error:
         fault = error
     context = {"title": title, "question": question, "numbers": numbers, "fault": fault, "here": "plans"}
@@ -85,16 +85,16 @@ def new(request: HttpRequest) -> HttpResponse:
 
 def _design(numbers: dict[str, str], assumed: Question) -> dict[str, Any]:
     """Return the plan's fields that follow from the calculator's numbers."""
-    found: dict[str, Any] = {"alpha": assumed.alpha} if "alpha" in numbers else {}
+    design: dict[str, Any] = {"alpha": assumed.alpha} if "alpha" in numbers else {}
     if "comparing" in numbers:
-        found["comparing"] = Comparing(assumed.comparing)
+        design["comparing"] = Comparing(assumed.comparing)
     if "stopping" in numbers:
         if numbers["stopping"] not in StoppingRule.values:
             raise EvaError(
                 _STOPPING_ALLOWED(stopping=numbers["stopping"], values=", ".join(StoppingRule.values))
             )
-        found["stopping"] = numbers["stopping"]
-    return found
+        design["stopping"] = numbers["stopping"]
+    return design
 
 
 @require_http_methods(["GET", "HEAD", "POST"])
@@ -109,11 +109,11 @@ def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
     if plan.state != PlanState.DRAFT:
         return redirect("result-plan", name=plan.name, version=plan.version)
     require_editor(plan, request.user)  # type: ignore[arg-type]
-    sight = visibility_for_request(request)
-    values, assumed = values_of(plan, sight), _assumed(request.GET)
+    visibility = visibility_for_request(request)
+    values, assumed = values_of(plan, visibility), _assumed(request.GET)
     context = {
-        **draft.choices_page(plan, sight, values),
-        **draft.state_page(plan, sight, faults={}, agreed=True, cycle_s=assumed.cycle_s),
+        **draft.choices_page(plan, visibility, values),
+        **draft.state_page(plan, visibility, faults={}, agreed=True, cycle_s=assumed.cycle_s),
         **_shown(values, values, {}),
         "assumed": assumed,
         "spread": _SPREAD,
@@ -125,33 +125,34 @@ def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
     user: Any = request.user
-    sight = visibility_for_request(request)
-    before = values_of(plan, sight)
-    wanted, faults = read(
+    visibility = visibility_for_request(request)
+    before = values_of(plan, visibility)
+    requested, faults = read(
         request.POST,
-        hidden=sight.checkpoints,
-        unseen=plan.checkpoints.filter(pk__in=sight.checkpoints).count(),
+        hidden=visibility.checkpoints,
+        unseen=plan.checkpoints.filter(pk__in=visibility.checkpoints).count(),
         owners=role_of(user) is Role.ADMIN and "owner" in request.POST,
     )
     was = _was(request)
     keep = request.POST.get("keep", "").split()
-    changed = plan_change(user=user, plan=plan, was=was, wanted=wanted, keep=keep)
+    changed = plan_change(user=user, plan=plan, was=was, wanted=requested, keep=keep)
     plan.refresh_from_db()
-    seen = {
-        name: changed.now[name] if wanted.get(name) == changed.now[name] else was.get(name) for name in before
+    last_shown = {
+        name: changed.now[name] if requested.get(name) == changed.now[name] else was.get(name)
+        for name in before
     }
-    others = [name for name, value in wanted.items() if name in before and value != changed.now[name]]
+    conflicting = [name for name, value in requested.items() if name in before and value != changed.now[name]]
     context = {
         **draft.state_page(
-            plan, sight, faults=faults, agreed=not others, cycle_s=_assumed(request.POST).cycle_s
+            plan, visibility, faults=faults, agreed=not conflicting, cycle_s=_assumed(request.POST).cycle_s
         ),
-        **_shown(changed.now, seen, faults),
-        "others": [(name, draft.value_text(name, changed.now[name], sight)) for name in others],
-        "keep": " ".join(others),
+        **_shown(changed.now, last_shown, faults),
+        "others": [(name, draft.value_text(name, changed.now[name], visibility)) for name in conflicting],
+        "keep": " ".join(conflicting),
         "fault_rows": [
             (name, faults.get(name, ""))
             for name in _FAULTY
-            if name in before and (name in wanted or name in faults)
+            if name in before and (name in requested or name in faults)
         ],
         "saved_at": timezone.localtime(),
         "fragment": True,
@@ -164,37 +165,37 @@ def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
 
 def _was(request: HttpRequest) -> dict[str, Any]:
     try:
-        found = bounded.parse_json(request.POST.get("was", "{}"), "was", _LARGEST)
+        values = bounded.parse_json(request.POST.get("was", "{}"), "was", _LARGEST)
     except bounded.UnreadableDocument as error:
         raise EvaError(str(error)) from None
-    if not isinstance(found, dict):
+    if not isinstance(values, dict):
         raise EvaError(_ALLOWED_WHAT_PAGE_SHOWN_BY)
-    return found
+    return values
 
 
-def _shown(now: Values, seen: Values, faults: dict[str, str]) -> dict[str, Any]:
+def _shown(now: Values, last_shown: Values, faults: dict[str, str]) -> dict[str, Any]:
     """Return the state of the shown page: its values, with which its next change is compared, and a digest.
 
     The digest of the saved values (`now`) is sent with a freeze.
     """
-    return {"was": json.dumps(seen), "seen": digest_of(now), "faults": faults}
+    return {"was": json.dumps(last_shown), "seen": digest_of(now), "faults": faults}
 
 
-def _assumed(given: QueryDict) -> Question:
+def _assumed(query: QueryDict) -> Question:
     """Return the calculator's input of a page; the default input if a value is not allowed."""
     try:
-        return question_of({name: given.get(name, "") for name in _CARRIED}, alike=True)
+        return question_of({name: query.get(name, "") for name in _CARRIED}, alike=True)
     except EvaError:
         return Question()
 
 
-def _spread(given: QueryDict) -> float:
+def _spread(query: QueryDict) -> float:
     """Return the assumed standard deviation of a score.
 
     Raises:
         EvaError: If it is not within 0.01 to 0.5.
     """
-    text = given.get("spread", "").strip() or str(_SPREAD)
+    text = query.get("spread", "").strip() or str(_SPREAD)
     try:
         value = float(text)
     except ValueError:
@@ -213,11 +214,11 @@ def power(request: HttpRequest, name: str, version: int) -> HttpResponse:
     require_editor(plan, request.user)  # type: ignore[arg-type]
     context: dict[str, Any] = {"plan": plan, "size": draft.Size.of(plan)}
     try:
-        given = question_of(request.GET, alike=plan.margin is not None)
+        question = question_of(request.GET, alike=plan.margin is not None)
         spread = _spread(request.GET) if plan.outcome == PrimaryOutcome.SCORE else _SPREAD
-        asked = draft.power_request(plan, draft.question_for(plan, given), spread)
-        if asked is not None:
-            context |= draft.power_page(plan, asked, figures(request.user.pk, asked))
+        power_request = draft.power_request(plan, draft.question_for(plan, question), spread)
+        if power_request is not None:
+            context |= draft.power_page(plan, power_request, figures(request.user.pk, power_request))
     except EvaError as error:
         context["fault"] = error
     return render(request, "results/draft/power.html", context)

@@ -122,10 +122,10 @@ def _preferred(request: HttpRequest) -> None:
 
 
 def _version(request: HttpRequest) -> int:
-    given = request.POST.get("version", "")
-    if not (given.isascii() and given.isdecimal() and len(given) < 7):
-        raise EvaError(_VERSION_ALLOWED_NUMBER(given=given))
-    return int(given)
+    text = request.POST.get("version", "")
+    if not (text.isascii() and text.isdecimal() and len(text) < 7):
+        raise EvaError(_VERSION_ALLOWED_NUMBER(given=text))
+    return int(text)
 
 
 def _view(handout: Handout | None) -> dict[str, Any] | None:

@@ -68,22 +68,22 @@ def planner(request: HttpRequest) -> HttpResponse:
 
 
 def _lab(request: HttpRequest) -> dict[str, Any]:
-    sight = visibility_for_request(request)
+    visibility = visibility_for_request(request)
     running = selectors.plan_rows(selectors.plan_list(PlanState.FROZEN)[:RUNNING])
     ended = selectors.plan_rows(
         selectors.plan_list().exclude(state__in=(PlanState.FROZEN, PlanState.DRAFT))[:5]
     )
     return {
         "running": running,
-        "ended": [(row, sealed_reason(row.plan, request.user, sight)) for row in ended],
-        "stations": [(now, _label(sight, now.trial)) for now in selectors.station_activity()],
+        "ended": [(row, sealed_reason(row.plan, request.user, visibility)) for row in ended],
+        "stations": [(now, _label(visibility, now.trial)) for now in selectors.station_activity()],
         "recent": [
-            (trial, sight.checkpoint_label(trial), sight.hides(trial))
+            (trial, visibility.checkpoint_label(trial), visibility.hides(trial))
             for trial in selectors.recent_trials(RECENT)
         ],
         "here": "lab",
     }
 
 
-def _label(sight: Visibility, trial: Any) -> str:
-    return sight.checkpoint_label(trial) if trial is not None else ""
+def _label(visibility: Visibility, trial: Any) -> str:
+    return visibility.checkpoint_label(trial) if trial is not None else ""

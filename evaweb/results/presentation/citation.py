@@ -57,18 +57,18 @@ class CitedRow:
     @property
     def cells(self) -> tuple[str, ...]:
         """Name, n, successes, rate with interval, and mean score, as text."""
-        known = self.success
+        success = self.success
         rate = "not kept"
-        if known is not None:
+        if success is not None:
             rate = (
-                f"{100 * known.rate:.0f} % [{format_interval(known.interval)}]"
-                if known.rate is not None and known.interval
+                f"{100 * success.rate:.0f} % [{format_interval(success.interval)}]"
+                if success.rate is not None and success.interval
                 else "–"
             )
         return (
             self.checkpoint,
             str(self.n),
-            "not kept" if known is None else str(known.successes),
+            "not kept" if success is None else str(success.successes),
             rate,
             "–" if self.score is None else f"{self.score:.2f}",
         )
@@ -117,9 +117,13 @@ class Citation:
     def sentence(self) -> str:
         """Headline, with the groups of checkpoints that share a letter."""
         letters = letters_of(self.plan, self.found, self.blocks)
-        said = ", ".join(f"{name} {of}" for name, of in letters)
-        told = f" No significant difference between checkpoints that share a letter: {said}." if said else ""
-        return sentence_of(self.plan, self.found, self.blocks) + "." + told
+        letter_list = ", ".join(f"{name} {of}" for name, of in letters)
+        letters_text = (
+            f" No significant difference between checkpoints that share a letter: {letter_list}."
+            if letter_list
+            else ""
+        )
+        return sentence_of(self.plan, self.found, self.blocks) + "." + letters_text
 
     @cached_property
     def blocks(self) -> list[Block]:
@@ -130,34 +134,34 @@ class Citation:
     def design(self) -> str:
         """Design as planned: rule, looks, pairs, alpha, question, outcome."""
         document = self.plan.document or {}
-        found = self.found
-        asks = " and ".join(_question(found, *names) for names in compared(document))
-        outcome = "success" if found.outcome == SUCCESS else "score (partial credit)"
+        design = self.found
+        asks = " and ".join(_question(design, *names) for names in compared(document))
+        outcome = "success" if design.outcome == SUCCESS else "score (partial credit)"
         blind = "operators blind" if document["blind"] else "operators not blind"
-        drops = "; checkpoints dropped once they were found worse" if found.drops else ""
-        order = "" if found.counts is None else ", checkpoints in random order"
+        drops = "; checkpoints dropped once they were found worse" if design.drops else ""
+        order = "" if design.counts is None else ", checkpoints in random order"
         return (
-            f"Design: {rule_text(self.plan)}, {_looks(found)}, {found.blocks} {found.unit} foreseen{order}, "
-            f"{alpha_text(found)}; asks {asks}, by {outcome}{drops}; {blind}{_declared(document)}."
+            f"Design: {rule_text(self.plan)}, {_looks(design)}, {design.blocks} {design.unit} foreseen{order}, "
+            f"{alpha_text(design)}; asks {asks}, by {outcome}{drops}; {blind}{_declared(document)}."
         )
 
     @cached_property
     def setting(self) -> str:
         """Robot, scenes, dates and scorers; "" for a reveal that did not record them."""
-        said = str(self.kept.get("setting", "")) if self.digest else setting_now(self.plan)
-        return f"{said}." if said else ""
+        text = str(self.kept.get("setting", "")) if self.digest else setting_now(self.plan)
+        return f"{text}." if text else ""
 
     @cached_property
     def source(self) -> str:
         """Source: plan, version, digests, address."""
         document = self.plan.document or {}
-        said = f"EVA Web, plan {document['name']} v{document['version']}, plan digest {self.plan.digest}"
+        plan_text = f"EVA Web, plan {document['name']} v{document['version']}, plan digest {self.plan.digest}"
         where = (
             f", as {'revealed' if self.plan.blind else 'closed'} {self.kept['at'][:10]}, digest {self.digest}"
             if self.digest
             else ", not revealed"
         )
-        return f"{said}{where}: {self.address}"
+        return f"{plan_text}{where}: {self.address}"
 
     @property
     def caveats(self) -> list[str]:
@@ -167,7 +171,7 @@ class Citation:
     @property
     def doubts(self) -> list[str]:
         """Reasons for doubt as lines of text."""
-        return [f"Reason for doubt: {said}." for said in self.caveats]
+        return [f"Reason for doubt: {caveat}." for caveat in self.caveats]
 
     @property
     def lines(self) -> list[str]:
@@ -227,7 +231,7 @@ class Citation:
         """Figure for a page."""
         names = [row["name"] for row in (self.plan.document or {})["checkpoints"]]
         order = {name: i for i, name in enumerate(names)}
-        return rates.draw_intervals("Success rates", [(name, found, "") for name, found in self.known], order)
+        return rates.draw_intervals("Success rates", [(name, rate, "") for name, rate in self.known], order)
 
     @cached_property
     def svg(self) -> str:
@@ -300,35 +304,37 @@ def citation(plan: Plan) -> Citation:
     Raises:
         Conflict: If trials are still being made, or no comparison was planned.
     """
-    found = frozen_design(plan.document) if plan.document else None
-    if found is None:
+    design = frozen_design(plan.document) if plan.document else None
+    if design is None:
         raise Conflict(_HAS_NO_COMPARISON_THERE_NO(plan=plan))
     if plan.state not in (PlanState.CLOSED, PlanState.REVEALED):
         raise Conflict(_RESULT_CITED_ONCE_PLAN_CLOSED(plan=plan, state=plan.get_state_display()))
-    kept = plan.at_reveal or reveal_record(plan) or {}
-    return Citation(plan, found, kept, plan.at_reveal["digest"] if plan.at_reveal else "")
+    reveal = plan.at_reveal or reveal_record(plan) or {}
+    return Citation(plan, design, reveal, plan.at_reveal["digest"] if plan.at_reveal else "")
 
 
 def _declared(document: Mapping[str, Any]) -> str:
     """Return the plan's rules on runs with an abnormal end as text: what each kind of end counts as."""
     counts = {"failure": "a failure", "repeated": "no trial, and is repeated"}
-    said = document.get("counts_as", {})
-    return "".join(f"; {ENDS[name]} makes {counts[said[name]]}" for name in ENDS if said.get(name) in counts)
+    counts_as = document.get("counts_as", {})
+    return "".join(
+        f"; {ENDS[name]} makes {counts[counts_as[name]]}" for name in ENDS if counts_as.get(name) in counts
+    )
 
 
-def _question(found: Design, first: str, second: str) -> str:
-    if found.margin is not None:
-        return f"whether {first} is not worse than {second} by {100 * found.margin:g} points or more"
+def _question(design: Design, first: str, second: str) -> str:
+    if design.margin is not None:
+        return f"whether {first} is not worse than {second} by {100 * design.margin:g} points or more"
     return f"whether {first} and {second} differ"
 
 
-def _looks(found: Design) -> str:
-    if found.rule == FIXED:
+def _looks(design: Design) -> str:
+    if design.rule == FIXED:
         return "one test at the end"
-    at = look_schedule(found)
-    if found.rule == ANYTIME or at == list(range(1, found.blocks + 1)):
-        return f"looked at after every {found.unit[:-1]}"
-    return f"looked at after {', '.join(map(str, at))} {found.unit}"
+    at = look_schedule(design)
+    if design.rule == ANYTIME or at == list(range(1, design.blocks + 1)):
+        return f"looked at after every {design.unit[:-1]}"
+    return f"looked at after {', '.join(map(str, at))} {design.unit}"
 
 
 def _text_table(rows: list[tuple[str, ...]]) -> str:
@@ -343,13 +349,13 @@ def _text_table(rows: list[tuple[str, ...]]) -> str:
 def _text_figure(rows: list[tuple[str, Proportion]]) -> str:
     wide = max((len(name) for name, _ in rows), default=0)
     lines = []
-    for name, found in rows:
+    for name, rate in rows:
         axis = [" "] * (_AXIS + 1)
-        if found.rate is not None and found.interval is not None:
-            low, high = round(found.interval.low * _AXIS), round(found.interval.high * _AXIS)
+        if rate.rate is not None and rate.interval is not None:
+            low, high = round(rate.interval.low * _AXIS), round(rate.interval.high * _AXIS)
             axis[low : high + 1] = "-" * (high + 1 - low)
-            axis[round(found.rate * _AXIS)] = "o"
-        lines.append(f"{name.ljust(wide)}  |{''.join(axis)}|  {rate_words(found)}")
+            axis[round(rate.rate * _AXIS)] = "o"
+        lines.append(f"{name.ljust(wide)}  |{''.join(axis)}|  {rate_words(rate)}")
     lines.append(f"{' ' * wide}   0 %{'100 %'.rjust(_AXIS - 2)}")
     return "\n".join(lines) + "\n"
 
@@ -374,15 +380,15 @@ def _latex_figure(rows: list[tuple[str, Proportion]]) -> str:
         x = _NAMES_MM + _AXIS_MM * percent / 100
         lines.append(rf"  \put({x:g},{_STEP_MM}){{\line(0,-1){{1}}}}")
         lines.append(rf"  \put({x:g},2){{\makebox(0,0){{\footnotesize {percent}\,\%}}}}")
-    for i, (name, found) in enumerate(rows):
+    for i, (name, rate) in enumerate(rows):
         y = high - _STEP_MM * i - _STEP_MM / 2
         lines.append(rf"  \put({_NAMES_MM - 3},{y:g}){{\makebox(0,0)[r]{{{escaped(name)}}}}}")
-        if found.rate is not None and found.interval is not None:
-            low, wide = found.interval.low * _AXIS_MM, (found.interval.high - found.interval.low) * _AXIS_MM
+        if rate.rate is not None and rate.interval is not None:
+            low, wide = rate.interval.low * _AXIS_MM, (rate.interval.high - rate.interval.low) * _AXIS_MM
             lines.append(rf"  \put({_NAMES_MM + low:.2f},{y:g}){{\line(1,0){{{wide:.2f}}}}}")
-            lines.append(rf"  \put({_NAMES_MM + found.rate * _AXIS_MM:.2f},{y:g}){{\circle*{{1.6}}}}")
-        words = escaped(rate_words(found))
+            lines.append(rf"  \put({_NAMES_MM + rate.rate * _AXIS_MM:.2f},{y:g}){{\circle*{{1.6}}}}")
+        label = escaped(rate_words(rate))
         lines.append(
-            rf"  \put({_NAMES_MM + _AXIS_MM + 3},{y:g}){{\makebox(0,0)[l]{{\footnotesize {words}}}}}"
+            rf"  \put({_NAMES_MM + _AXIS_MM + 3},{y:g}){{\makebox(0,0)[l]{{\footnotesize {label}}}}}"
         )
     return "\n".join([*lines, r"\end{picture}\endgroup"]) + "\n"

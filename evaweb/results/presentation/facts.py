@@ -43,9 +43,10 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
     differs = found.corrected <= analysis.alpha
     if differs and difference.value < 0:
         better, worse, difference = worse, better, difference.swapped
-    one, other = analysis.arm(better).success, analysis.arm(worse).success
+    first, second = analysis.arm(better).success, analysis.arm(worse).success
     counts = (
-        f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {format_points(difference)}"
+        f"{first.successes}/{first.n} against {second.successes}/{second.n}, "
+        f"difference {format_points(difference)}"
     )
     if differs:
         return f"{better} succeeded more often than {worse}: {counts}"
@@ -73,11 +74,11 @@ def comparison_facts(result: PlanResult, found: Comparison) -> dict[str, Any]:
     }
 
 
-def _facts(result: PlanResult, found: Comparison, own: str) -> Iterator[ComparisonFact]:
+def _facts(result: PlanResult, comparison: Comparison, own: str) -> Iterator[ComparisonFact]:
     context = AnswerContext(
         fixed=result.plan.stopping == StoppingRule.NONE, several=len(result.analysis.comparisons) > 1
     )
-    for name, answer in answer_all(found, context):
+    for name, answer in answer_all(comparison, context):
         yield ComparisonFact(*answer, name == own)
 
 
@@ -101,4 +102,6 @@ def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> st
     n = min(arm.success.n for arm in arms)
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)
     compared = analysis.comparisons if found is None else (found,)
-    return undetectable_gain_sentence(n, rate, max((one.alpha for one in compared), default=analysis.alpha))
+    return undetectable_gain_sentence(
+        n, rate, max((comparison.alpha for comparison in compared), default=analysis.alpha)
+    )

@@ -32,20 +32,20 @@ def draw_arms(
 
 
 def _draw_funnel(arms: Sequence[Arm], scene: str, link: Link, mixed: bool) -> Drawing | None:
-    found = [
+    funnels = [
         (arm.series, arm.checkpoint, funnel)
         for arm in arms
         for funnel in arm.funnels
         if funnel.scene == scene
     ]
-    if not found or (len({funnel.labels for _, _, funnel in found}) > 1 and not mixed):
+    if not funnels or (len({funnel.labels for _, _, funnel in funnels}) > 1 and not mixed):
         return None
     links = {
         (name, at): link(checkpoint=name, scene=scene, missed=label)
-        for _, name, funnel in found
+        for _, name, funnel in funnels
         for at, label in enumerate(funnel.labels)
     }
-    return time_courses.draw_funnel(scene, found, links)
+    return time_courses.draw_funnel(scene, funnels, links)
 
 
 def _grid_links(arms: Sequence[Arm], link: Link) -> dict[tuple[str, str], str]:

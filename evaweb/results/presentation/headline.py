@@ -83,23 +83,23 @@ class Headline:
     @property
     def caveats(self) -> tuple[str, ...]:
         """Alternative headlines, one sentence each, without corrections after the reveal."""
-        found = [*self.estimates]
+        caveats = [*self.estimates]
         if self.at_first:
-            found.append(
+            caveats.append(
                 "Some scored trials were voided, have a void pending, or had their score corrected before the reveal. "
                 f"With every first score and no voids: {self.at_first}"
             )
         if self.worst:
-            found.append(
+            caveats.append(
                 "Some attempts were discarded without a score. If each had ended in the worst way for this result: "
                 f"{self.worst}"
             )
         if self.versions:
-            found.append(
+            caveats.append(
                 "Each earlier version of the plan used its full alpha: read together, they err more often than alpha "
                 f"says. {'. '.join(self.versions)}"
             )
-        return tuple(found)
+        return tuple(caveats)
 
     @property
     def document(self) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def conclude(plan: Plan, found: Design, now: Tried, decided: Sequence[Block]) ->
         f"{rule_text(plan)}, {alpha_text(found)}",
         _other(plan, found, now.counted, decided),
         _other(plan, found, now.at_first, decided),
-        ". ".join(told.sentence for told in in_the_worst_case(plan, found, decided, now)),
+        ". ".join(case.sentence for case in in_the_worst_case(plan, found, decided, now)),
         tuple(_estimates(plan, found, decided)),
         _versions(plan),
         letters_of(plan, found, decided),
@@ -148,10 +148,10 @@ def sentence_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
 def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[str, ...]:
     """Return one sentence per comparison."""
     names = compared(plan.document or {})
-    said = findings(found, blocks).each
+    conclusions = findings(found, blocks).each
     return tuple(
-        _sentence(plan, found, one, pair, name, blocks)
-        for one, pair, name in zip(said, found.comparisons, names, strict=True)
+        _sentence(plan, found, conclusion, pair, name, blocks)
+        for conclusion, pair, name in zip(conclusions, found.comparisons, names, strict=True)
     )
 
 
@@ -161,19 +161,21 @@ def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tupl
     """
     names = compared(plan.document or {})
     arms = arms_of(names)
-    said = findings(found, blocks)
-    if not _ranks(found, arms, said):
+    results = findings(found, blocks)
+    if not _ranks(found, arms, results):
         return ()
     rates = {name: _mean(blocks, number) for number, name in enumerate(arms)}
     ranked = sorted(arms, key=lambda name: (-rates[name], name))
-    apart = {frozenset(name) for name, one in zip(names, said.each, strict=True) if one.winner}
+    apart = {
+        frozenset(name) for name, conclusion in zip(names, results.each, strict=True) if conclusion.winner
+    }
     return tuple((name, letter) for name, letter in letters(ranked, apart).items())
 
 
-def _ranks(found: Design, arms: Sequence[str], said: Findings) -> bool:
+def _ranks(design: Design, arms: Sequence[str], results: Findings) -> bool:
     """Return True if three or more checkpoints were all compared with each other, and every comparison has ended."""
-    of_all = len(arms) > 2 and len(found.comparisons) == len(arms) * (len(arms) - 1) // 2
-    return of_all and found.margin is None and bool(said.ended)
+    of_all = len(arms) > 2 and len(design.comparisons) == len(arms) * (len(arms) - 1) // 2
+    return of_all and design.margin is None and bool(results.ended)
 
 
 def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
@@ -182,11 +184,11 @@ def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
     "" if it was not asked for or is not decided, or if a test of scores only shows that they differ.
     """
     document = plan.document or {}
-    arms, said = arms_of(compared(document)), findings(found, blocks)
+    arms, results = arms_of(compared(document)), findings(found, blocks)
     differ = found.outcome != SUCCESS and found.rule == FIXED
-    if document.get("format", 1) < _BEST or differ or not _ranks(found, arms, said):
+    if document.get("format", 1) < _BEST or differ or not _ranks(found, arms, results):
         return ""
-    left = unbeaten(found, said)
+    left = unbeaten(found, results)
     if len(left) == 1:
         return f"{arms[left[0]]} is the best of {len(arms)}"
     if not left:
@@ -208,37 +210,49 @@ def _mean(blocks: Sequence[Block], arm: int) -> float:
 
 
 def _sentence(
-    plan: Plan, found: Design, one: Conclusion, pair: tuple[int, int], names: Names, blocks: Sequence[Block]
+    plan: Plan,
+    design: Design,
+    conclusion: Conclusion,
+    pair: tuple[int, int],
+    names: Names,
+    blocks: Sequence[Block],
 ) -> str:
     first, second = names
-    if not one.ended:
-        made = f"{one.blocks} of {found.blocks} {found.unit}"
+    if not conclusion.ended:
+        progress = f"{conclusion.blocks} of {design.blocks} {design.unit}"
         if plan.state == PlanState.FROZEN:
-            return f"{first} and {second} are not compared yet: {made} are made, and the design goes on"
+            return f"{first} and {second} are not compared yet: {progress} are made, and the design goes on"
         if visible_close_reason(plan, sealed=True):  # the design had ended with other scores
-            return f"{first} and {second} would not be compared yet after {made}: the design would go on"
-        return f"{first} and {second} were not compared: closed after {made}, before the design ended"
-    sides = [[v for block in blocks[: one.ended_at_pair] for arm, v in block if arm == side] for side in pair]
-    if one.winner == "second":  # the better checkpoint is named first
+            return f"{first} and {second} would not be compared yet after {progress}: the design would go on"
+        return f"{first} and {second} were not compared: closed after {progress}, before the design ended"
+    sides = [
+        [v for block in blocks[: conclusion.ended_at_pair] for arm, v in block if arm == side]
+        for side in pair
+    ]
+    if conclusion.winner == "second":  # the better checkpoint is named first
         sides.reverse()
-    counts = _counts(found, one, *sides)
-    if found.margin is not None:
-        claim = f"{first} is {'' if one.winner else 'not shown to be '}not worse than {second}"
-        return f"{claim} by {100 * found.margin:g} points or more: {counts}"
-    if one.winner is None and not one.dropped and not _could_separate(plan, found, pair, blocks):
-        return f"Undecided: {one.ended_at_pair} {found.unit} cannot tell {first} and {second} apart: {counts}"
-    if one.winner is None:
-        why = ", when one of them was dropped" if one.dropped else ""
-        return f"No significant difference between {first} and {second}: {counts}{why}"
-    better, worse = (first, second) if one.winner == "first" else (second, first)
-    if found.outcome == SUCCESS:
+    counts = _counts(design, conclusion, *sides)
+    if design.margin is not None:
+        claim = f"{first} is {'' if conclusion.winner else 'not shown to be '}not worse than {second}"
+        return f"{claim} by {100 * design.margin:g} points or more: {counts}"
+    if (
+        conclusion.winner is None
+        and not conclusion.dropped
+        and not _could_separate(plan, design, pair, blocks)
+    ):
+        return f"Undecided: {conclusion.ended_at_pair} {design.unit} cannot tell {first} and {second} apart: {counts}"
+    if conclusion.winner is None:
+        suffix = ", when one of them was dropped" if conclusion.dropped else ""
+        return f"No significant difference between {first} and {second}: {counts}{suffix}"
+    better, worse = (first, second) if conclusion.winner == "first" else (second, first)
+    if design.outcome == SUCCESS:
         return f"{better} succeeded more often than {worse}: {counts}"
-    if found.rule == FIXED and (plan.document or {}).get("format", 1) >= _DIFFER:
+    if design.rule == FIXED and (plan.document or {}).get("format", 1) >= _DIFFER:
         return f"Scores of {better} and {worse} differ: {counts}"
     return f"{better} reached higher scores than {worse}: {counts}"
 
 
-def _could_separate(plan: Plan, found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
+def _could_separate(plan: Plan, design: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
     """Return True if this many trials could have separated the pair.
 
     That is so if they separate it when every trial of its first checkpoint succeeds and every other one fails.
@@ -246,42 +260,46 @@ def _could_separate(plan: Plan, found: Design, pair: tuple[int, int], blocks: Se
     if (plan.document or {}).get("format", 1) < _UNDECIDED:
         return True
     apart = [tuple((arm, float(arm == pair[0])) for arm, _ in block) for block in blocks]
-    return findings(found, apart).each[found.comparisons.index(pair)].winner is not None
+    return findings(design, apart).each[design.comparisons.index(pair)].winner is not None
 
 
-def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Sequence[float]) -> str:
-    n, m = len(ours), len(theirs)
-    if found.outcome != SUCCESS:
-        chance = "" if one.p is None else f", {p_words(one.p)},"
-        return f"mean scores {sum(ours) / n:.2f} and {sum(theirs) / m:.2f}{chance} after {n} pairs"
-    words = f"{sum(ours):.0f}/{n} against {sum(theirs):.0f}/{m}"
-    if one.p is not None:  # fixed number: an interval of the difference has its nominal coverage
+def _counts(design: Design, conclusion: Conclusion, first: Sequence[float], second: Sequence[float]) -> str:
+    n, m = len(first), len(second)
+    if design.outcome != SUCCESS:
+        chance = "" if conclusion.p is None else f", {p_words(conclusion.p)},"
+        return f"mean scores {sum(first) / n:.2f} and {sum(second) / m:.2f}{chance} after {n} pairs"
+    text = f"{sum(first):.0f}/{n} against {sum(second):.0f}/{m}"
+    if conclusion.p is not None:  # fixed number: an interval of the difference has its nominal coverage
         if n and m:
-            words += f", difference {format_points(newcombe(int(sum(ours)), n, int(sum(theirs)), m))}"
-        words += f", {p_words(one.p)}"
-    return f"{words}, after {one.ended_at_pair} of {found.blocks} {found.unit}"
+            text += f", difference {format_points(newcombe(int(sum(first)), n, int(sum(second)), m))}"
+        text += f", {p_words(conclusion.p)}"
+    return f"{text}, after {conclusion.ended_at_pair} of {design.blocks} {design.unit}"
 
 
-def _other(plan: Plan, found: Design, blocks: Sequence[Block], decided: Sequence[Block]) -> str:
+def _other(plan: Plan, design: Design, blocks: Sequence[Block], decided: Sequence[Block]) -> str:
     """Return the conclusion from `blocks`; "" if they are the same as `decided`."""
-    return "" if same_blocks(blocks, decided) else sentence_of(plan, found, blocks)
+    return "" if same_blocks(blocks, decided) else sentence_of(plan, design, blocks)
 
 
-def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[str]:
+def _estimates(plan: Plan, design: Design, blocks: Sequence[Block]) -> Iterator[str]:
     """Yield the corrected estimate of each comparison that stopped at a boundary: its raw difference is too
     large on average.
     """
-    each = zip(compared(plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True)
-    for (first, second), pair, one in each:
-        said = estimated(found, blocks, pair, one) if one.ended == "boundary" and one.winner else None
-        if said is None:
+    rows = zip(compared(plan.document or {}), design.comparisons, findings(design, blocks).each, strict=True)
+    for (first, second), pair, conclusion in rows:
+        difference = (
+            estimated(design, blocks, pair, conclusion)
+            if conclusion.ended == "boundary" and conclusion.winner
+            else None
+        )
+        if difference is None:
             continue
-        if one.winner == "second":
-            first, second, said = second, first, said.swapped
+        if conclusion.winner == "second":
+            first, second, difference = second, first, difference.swapped
         yield (
-            f"{first} is ahead of {second} by {format_points(said)}, corrected for stopping early (median unbiased "
-            "over all ways in which the design can end; where it ends early this is still mostly too large, the raw "
-            "difference more so)"
+            f"{first} is ahead of {second} by {format_points(difference)}, corrected for stopping early "
+            "(median unbiased over all ways in which the design can end; where it ends early this is still mostly "
+            "too large, the raw difference more so)"
         )
 
 
@@ -298,18 +316,24 @@ class WorstCase:
 
 def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: Tried) -> list[WorstCase]:
     """Return the worst case of each comparison that has a winner and discarded attempts."""
-    told = []
+    cases = []
     now = _as_decided(now, decided)
-    for number, one in enumerate(findings(found, decided).each):
+    for number, conclusion in enumerate(findings(found, decided).each):
         pair = found.comparisons[number]
-        blocks = now.against(*(pair if one.winner == "first" else pair[::-1])) if one.winner else now.counted
+        blocks = (
+            now.against(*(pair if conclusion.winner == "first" else pair[::-1]))
+            if conclusion.winner
+            else now.counted
+        )
         if blocks != now.counted:
             # Other outcomes would have dropped other arms, whose trials do not exist: each comparison counts on its
             # own, up to its end.
-            single, both = alone(found, pair, blocks[: one.ended_at_pair]) if found.drops else (found, blocks)
-            sentence, other = conclude_alone(plan, single, number, both)
-            told.append(WorstCase(sentence, other.winner == one.winner))
-    return told
+            single, both = (
+                alone(found, pair, blocks[: conclusion.ended_at_pair]) if found.drops else (found, blocks)
+            )
+            sentence, worst = conclude_alone(plan, single, number, both)
+            cases.append(WorstCase(sentence, worst.winner == conclusion.winner))
+    return cases
 
 
 def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
@@ -319,15 +343,15 @@ def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
     outcomes: list[Block] = []
     for block, before in zip(now.counted, decided, strict=True):
         left = [*before]
-        found = []
+        matched = []
         for arm, _ in block:
-            at = next((i for i, (other, _) in enumerate(left) if other == arm), None)
+            at = next((i for i, (candidate, _) in enumerate(left) if candidate == arm), None)
             if at is None:
                 return now
-            found.append(left.pop(at))
+            matched.append(left.pop(at))
         if left:
             return now
-        outcomes.append(tuple(found))
+        outcomes.append(tuple(matched))
     return replace(now, counted=outcomes)
 
 
@@ -337,20 +361,20 @@ def conclude_alone(
     """Return sentence and conclusion of comparison `number` from these blocks by the design `single`."""
     names = compared(plan.document or {})[number]
     pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
-    one = evaluate_design(single, blocks, pair)
-    return _sentence(plan, single, one, pair, names, blocks), one
+    conclusion = evaluate_design(single, blocks, pair)
+    return _sentence(plan, single, conclusion, pair, names, blocks), conclusion
 
 
 def _versions(plan: Plan) -> tuple[str, ...]:
     """Return the headline of each earlier version, newest first: each had its own full alpha."""
-    told, version = [], plan.amends
+    sentences, version = [], plan.amends
     while version is not None:
-        found = frozen_design(version.document) if version.document else None
-        if found is not None:
-            sentence = sentence_of(version, found, blocks_that_count(version))
-            told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
+        design = frozen_design(version.document) if version.document else None
+        if design is not None:
+            sentence = sentence_of(version, design, blocks_that_count(version))
+            sentences.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
         version = version.amends
-    return tuple(told)
+    return tuple(sentences)
 
 
 def _amended(version: Plan) -> str:

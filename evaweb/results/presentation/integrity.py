@@ -18,11 +18,11 @@ _RARE = 0.05  # probability at or below which an anchor counts as drifting
 
 def integrity_document(plan: Plan) -> dict[str, Any]:
     """Return the conduct of the plan, its alternative headlines, and `remarks` that summarise both."""
-    looks = bench_images(plan)
-    runs = all_attempts(plan, looks)
+    images = bench_images(plan)
+    runs = all_attempts(plan, images)
     matches = {run.trial: run.match for run in runs if run.match is not None}
-    found = {**plan_conduct(plan, runs, looks), "headline": headline_alternatives(plan, matches)}
-    return {**found, "remarks": list(_remarks(found))}
+    document = {**plan_conduct(plan, runs, images), "headline": headline_alternatives(plan, matches)}
+    return {**document, "remarks": list(_remarks(document))}
 
 
 def delays_banner(found: Mapping[str, Any]) -> str:
@@ -32,16 +32,16 @@ def delays_banner(found: Mapping[str, Any]) -> str:
     for row in delays["rows"]:
         for test in row["tests"]:
             if test["corrected"] is not None and test["corrected"] <= delays["alpha"]:
-                said = f"{row['what']}, by {_seconds(test['difference'])} s, {p_words(test['corrected'])}"
-                differing[test["first"], test["second"]].append(said)
+                text = f"{row['what']}, by {_seconds(test['difference'])} s, {p_words(test['corrected'])}"
+                differing[test["first"], test["second"]].append(text)
     if not differing:
         return ""
-    told = ". ".join(
-        f"Delays of {first} and {second} differ: {'; '.join(said)}"
-        for (first, second), said in differing.items()
+    sentences = ". ".join(
+        f"Delays of {first} and {second} differ: {'; '.join(text)}"
+        for (first, second), text in differing.items()
     )
     return (
-        f"{told}. If delays differed by chance alone, a difference as large would be as rare as this (sign flips "
+        f"{sentences}. If delays differed by chance alone, a difference as large would be as rare as this (sign flips "
         f"within pairs, Holm over {delays['tested']})"
     )
 
@@ -56,24 +56,24 @@ def too_few_text(found: Mapping[str, Any]) -> str:
     return f"{_of(most, 'pair')} {'is' if most == 1 else 'are'} too few for any of these tests"
 
 
-def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
-    other = [row["what"] for row in found["headline"] if row["same"] is False]
-    if other:
-        yield f"The headline would change: {'; '.join(other)}"
-    looks = [row["by_name"] for row in found["looks"] if row["own"]]
-    if looks:
-        yield f"Looked behind the blind before the reveal: {', '.join(looks)}"
-    for row in found["looks"]:
+def _remarks(document: Mapping[str, Any]) -> Iterator[str]:
+    changed = [row["what"] for row in document["headline"] if row["same"] is False]
+    if changed:
+        yield f"The headline would change: {'; '.join(changed)}"
+    people = [row["by_name"] for row in document["looks"] if row["own"]]
+    if people:
+        yield f"Looked behind the blind before the reveal: {', '.join(people)}"
+    for row in document["looks"]:
         if not row["own"]:
             when = "before this version was frozen" if row["before"] else "before the reveal of this one"
             yield f"{row['by_name']} looked behind the blind of {row['name']} v{row['version']} {when}"
-    if found["beside"]:
+    if document["beside"]:
         named = ", ".join(
-            f"{row['plan']} v{row['version']} ({_of(row['trials'], 'trial')})" for row in found["beside"]
+            f"{row['plan']} v{row['version']} ({_of(row['trials'], 'trial')})" for row in document["beside"]
         )
         yield f"Other plans are of checkpoints of this one, and may have told of them: {named}"
-    late = Counter(row["changed"] for row in found["corrections"] if row["late"])
-    early = sum(row["changed"] == VERDICT and not row["late"] for row in found["corrections"])
+    late = Counter(row["changed"] for row in document["corrections"] if row["late"])
+    early = sum(row["changed"] == VERDICT and not row["late"] for row in document["corrections"])
     if early:
         yield f"{_of(early, 'score')} corrected before the reveal"
     if late[VERDICT]:
@@ -81,46 +81,46 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
     if late[CATEGORY]:
         categories = "1 failure category" if late[CATEGORY] == 1 else f"{late[CATEGORY]} failure categories"
         yield f"{categories} corrected after the reveal"
-    rows = found["checkpoints"]
-    for what, words in (("voided", "voided"), ("repeated", "repeated"), ("interrupted", "interrupted")):
-        if any(row[what] for row in rows):
-            counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
-            yield f"Attempts {words}: {counts}"
-    for what in (ESTOP, INTERRUPTION):  # not time limits: most failing runs end by them
-        if any(row[what] for row in rows):
-            counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
-            yield f"Runs ended by {ENDINGS[what]}: {counts}"
+    rows = document["checkpoints"]
+    for field, label in (("voided", "voided"), ("repeated", "repeated"), ("interrupted", "interrupted")):
+        if any(row[field] for row in rows):
+            counts = ", ".join(f"{row['checkpoint']} {row[field]} of {row['attempts']}" for row in rows)
+            yield f"Attempts {label}: {counts}"
+    for field in (ESTOP, INTERRUPTION):  # not time limits: most failing runs end by them
+        if any(row[field] for row in rows):
+            counts = ", ".join(f"{row['checkpoint']} {row[field]} of {row['attempts']}" for row in rows)
+            yield f"Runs ended by {ENDINGS[field]}: {counts}"
     if any(row["declared"] for row in rows):
         counts = ", ".join(f"{row['checkpoint']} {row['declared']} of {row['counted']}" for row in rows)
         yield f"Failures by the plan, whatever was reached: {counts}"
-    edits = Counter(row["what"] for row in found["edits"])
+    edits = Counter(row["what"] for row in document["edits"])
     if edits:
-        named = ", ".join(f"{what} ({number})" for what, number in sorted(edits.items()))
+        named = ", ".join(f"{field} ({number})" for field, number in sorted(edits.items()))
         yield f"Edited after the plan was frozen, taken back or not: {named}"
-    yield from _departures(found)
+    yield from _departures(document)
 
 
-def _departures(found: Mapping[str, Any]) -> Iterator[str]:
-    deviations = found["deviations"]
+def _departures(document: Mapping[str, Any]) -> Iterator[str]:
+    deviations = document["deviations"]
     kinds = (
         ("split_stations", "carried out on more than one station"),
         ("split_operators", "carried out by more than one operator"),
         ("order", "not in the order drawn"),
         ("over_a_day", "more than a day apart"),
     )
-    for name, words in kinds:
+    for name, label in kinds:
         if deviations[name]:
-            yield f"{_of(len(deviations[name]), 'block')} {words}"
+            yield f"{_of(len(deviations[name]), 'block')} {label}"
     if deviations["out_of_turn"]:
         yield f"{_of(len(deviations['out_of_turn']), 'trial')} handed out of turn"
     for name in ("operators", "stations"):
-        if found[name]["uneven"]:
-            yield f"{name.capitalize()} did not share checkpoints evenly: up to {found[name]['uneven']:g} trials off"
-    if found["cameras"]["unchecked"]:
-        yield f"{_of(len(found['cameras']['unchecked']), 'trial')} without cameras confirmed in the 12 hours before"
+        if document[name]["uneven"]:
+            yield f"{name.capitalize()} did not share checkpoints evenly: up to {document[name]['uneven']:g} trials off"
+    if document["cameras"]["unchecked"]:
+        yield f"{_of(len(document['cameras']['unchecked']), 'trial')} without cameras confirmed in the 12 hours before"
 
-    yield from _of_the_bench(found["bench"])
-    for row in found["anchors"]:
+    yield from _of_the_bench(document["bench"])
+    for row in document["anchors"]:
         for name, since in (("against_earlier", "earlier plans"), ("within", "its first half")):
             if row[name] is not None and row[name] <= _RARE:
                 yield (
@@ -143,8 +143,8 @@ def _of_the_bench(bench: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _of(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+def _of(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _seconds(value: float) -> str:

@@ -74,8 +74,8 @@ def escaped(text: str) -> str:
 
     Characters without a command are unchanged: LuaLaTeX and XeLaTeX print them. Line breaks become blanks.
     """
-    said = "".join(_letter(letter) for letter in unicodedata.normalize("NFC", text))
-    return re.sub(r"-(?=-)", "-{}", said)  # two hyphens would become a dash
+    letters = "".join(_letter(letter) for letter in unicodedata.normalize("NFC", text))
+    return re.sub(r"-(?=-)", "-{}", letters)  # two hyphens would become a dash
 
 
 def foreign(text: str) -> list[str]:
@@ -84,9 +84,9 @@ def foreign(text: str) -> list[str]:
 
 
 def _letter(letter: str) -> str:
-    found = _ASCII.get(letter) or _SIGNS.get(letter)
-    if found is not None:
-        return found
+    command = _ASCII.get(letter) or _SIGNS.get(letter)
+    if command is not None:
+        return command
     if unicodedata.category(letter).startswith(("C", "Z")) and letter != " ":
         return " "
     return letter if letter.isascii() else _accented(letter) or _greek(letter) or letter
@@ -94,13 +94,13 @@ def _letter(letter: str) -> str:
 
 def _accented(letter: str) -> str:
     base, *marks = unicodedata.normalize("NFD", letter)
-    known = base.isascii() and len(marks) == 1 and marks[0] in _ACCENTS
-    return f"\\{_ACCENTS[marks[0]]}{{{base}}}" if known else ""
+    has_command = base.isascii() and len(marks) == 1 and marks[0] in _ACCENTS
+    return f"\\{_ACCENTS[marks[0]]}{{{base}}}" if has_command else ""
 
 
 def _greek(letter: str) -> str:
-    found = _GREEK.fullmatch(unicodedata.name(letter, ""))
-    if found is None:
+    match = _GREEK.fullmatch(unicodedata.name(letter, ""))
+    if match is None:
         return ""
-    name = found[1].lower() if found[1] else found[2].capitalize()
+    name = match[1].lower() if match[1] else match[2].capitalize()
     return f"$\\{name.replace('lamda', 'lambda').replace('Lamda', 'Lambda')}$"

@@ -101,7 +101,7 @@ def _failure_table(
         """Return the count and the trials' address for a phase and a cause; None stands for all phases or causes."""
         chosen = [m for m in arm.failures if phase in (None, m.phase) and cause in (None, m.cause)]
         named = {"failure_phase": phase, "failure": cause}
-        where = {field: words or UNSPECIFIED for field, words in named.items() if words is not None}
+        where = {field: value or UNSPECIFIED for field, value in named.items() if value is not None}
         return Cell(sum(m.count for m in chosen), address(checkpoint=arm.checkpoint, **where))
 
     rows = [(cause or UNSPECIFIED, [cell(phase, cause) for phase in (*phases, None)]) for cause in causes]
@@ -115,9 +115,9 @@ def _failure_table(
     }
 
 
-def _ordered(found: set[str], order: Sequence[str]) -> list[str]:
-    place = {words: i for i, words in enumerate(order)}
-    return sorted(found, key=lambda words: (not words, place.get(words, len(place)), words))
+def _ordered(values: set[str], order: Sequence[str]) -> list[str]:
+    place = {value: i for i, value in enumerate(order)}
+    return sorted(values, key=lambda value: (not value, place.get(value, len(place)), value))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +149,13 @@ def differs(pair: Pair) -> bool:
 
 def pair_rows(pairs: Sequence[tuple[int, Pair]]) -> list[dict[str, Any]]:
     """Return both trials of each numbered block with their recordings, and the address of synchronous playback."""
-    wanted = [run.trial for _, pair in pairs for run in (pair.first, pair.second)]
-    episodes = {row.trial.pk: row for row in Episode.objects.filter(trial__in=wanted).select_related("trial")}
+    trials = [run.trial for _, pair in pairs for run in (pair.first, pair.second)]
+    episodes = {row.trial.pk: row for row in Episode.objects.filter(trial__in=trials).select_related("trial")}
     rows = []
     for number, pair in pairs:
         sides = [Side(run, episodes.get(run.trial)) for run in (pair.first, pair.second)]
-        beside = side_by_side_url([side.episode.uuid for side in sides if side.episode])
-        rows.append({"number": number, "pair": pair, "sides": sides, "beside": beside})
+        address = side_by_side_url([side.episode.uuid for side in sides if side.episode])
+        rows.append({"number": number, "pair": pair, "sides": sides, "beside": address})
     return rows
 
 
@@ -189,7 +189,10 @@ def trial_filters(runs: Sequence[Outcome]) -> list[Filter]:
     return [
         *(
             Filter(
-                name, labels.get(name, name.capitalize()), [(one, one) for one in values[name]], strict=False
+                name,
+                labels.get(name, name.capitalize()),
+                [(value, value) for value in values[name]],
+                strict=False,
             )
             for name in names
         ),

@@ -57,18 +57,18 @@ class PlanResult:
 
         Letters of checkpoints whose trials are filtered out are omitted.
         """
-        found = caching.cached_analysis(self.plan, self.only, self.at)
+        analysis = caching.cached_analysis(self.plan, self.only, self.at)
         if self.design is None or len(self.design.comparisons) < 3:
-            return found
-        there = {arm.checkpoint for arm in found.arms}
+            return analysis
+        names = {arm.checkpoint for arm in analysis.arms}
         letters = letters_of(self.plan, self.design, self.blocks)
-        return replace(found, letters={n: of for n, of in letters if n in there}) if letters else found
+        return replace(analysis, letters={n: of for n, of in letters if n in names}) if letters else analysis
 
     @property
     def primaries(self) -> list[Comparison]:
         """Planned comparisons for which both checkpoints have trials."""
-        found = (self.analysis.comparison_of(*names) for names in compared(self.plan.document or {}))
-        return [one for one in found if one is not None]
+        comparisons = (self.analysis.comparison_of(*names) for names in compared(self.plan.document or {}))
+        return [comparison for comparison in comparisons if comparison is not None]
 
     @cached_property
     def corrected(self) -> dict[str, Proportion]:
@@ -88,8 +88,8 @@ class PlanResult:
     @cached_property
     def blocks(self) -> list[Block]:
         """Blocks that count: those of the reveal if there was one, else the current ones."""
-        kept = stored_blocks(self.plan)
-        return self.tried.counted if kept is None else kept
+        stored = stored_blocks(self.plan)
+        return self.tried.counted if stored is None else stored
 
     @cached_property
     def headline(self) -> Headline | None:

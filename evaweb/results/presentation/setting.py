@@ -13,8 +13,8 @@ from evaweb.trials.models import Score, TrialStatus
 
 def setting_of(plan: Plan) -> str:
     """Return a sentence on the trials that count, as recorded at the reveal or as of now; "" without trials."""
-    kept = (plan.at_reveal or {}).get("setting")
-    return setting_now(plan) if kept is None else str(kept)
+    stored = (plan.at_reveal or {}).get("setting")
+    return setting_now(plan) if stored is None else str(stored)
 
 
 def setting_now(plan: Plan) -> str:
@@ -39,10 +39,10 @@ def setting_now(plan: Plan) -> str:
     scenes = [f'{scene["title"]}, "{scene["instruction"]}"' for scene in (plan.document or {})["scenes"]]
     return (
         f"{count} trial{'s' if count > 1 else ''} on {_and(robots)} at {_and(stations)}, {' to '.join(days)}; "
-        f"{'; '.join(scenes)}; scored by {_and(f'{who} ({n})' for who, n in scorers.items())}"
+        f"{'; '.join(scenes)}; scored by {_and(f'{scorer} ({n})' for scorer, n in scorers.items())}"
     )
 
 
-def _and(given: Iterable[str]) -> str:
-    words = sorted(given)
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+def _and(parts: Iterable[str]) -> str:
+    ordered = sorted(parts)
+    return " and ".join(filter(None, (", ".join(ordered[:-1]), ordered[-1])))

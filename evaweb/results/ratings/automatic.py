@@ -91,14 +91,14 @@ def judge_forbid(*, user: User, judge: AutomaticJudge) -> None:
 
 def judges_ready() -> list[AutomaticJudge]:
     """Return the judges that could be used now."""
-    found = []
+    judges = []
     for judge in AutomaticJudge.objects.all():
         try:
             _ready(judge)
         except EvaError:
             continue
-        found.append(judge)
-    return found
+        judges.append(judge)
+    return judges
 
 
 def request_judging(*, user: User, plan: Plan, name: str) -> Job:
@@ -126,11 +126,11 @@ def enqueue_judging(*, plan: Plan, judge: str) -> Job:
 
 
 def _judge(name: str) -> AutomaticJudge:
-    found = AutomaticJudge.objects.filter(name=name).first()
-    if found is None:
-        there = ", ".join(AutomaticJudge.objects.values_list("name", flat=True))
-        raise NotFound(_THERE_NO_JUDGE_THERE(name=name, there=there or "none, an administrator adds them"))
-    return found
+    judge = AutomaticJudge.objects.filter(name=name).first()
+    if judge is None:
+        names = ", ".join(AutomaticJudge.objects.values_list("name", flat=True))
+        raise NotFound(_THERE_NO_JUDGE_THERE(name=name, there=names or "none, an administrator adds them"))
+    return judge
 
 
 def _ready(judge: AutomaticJudge) -> UsableJudge:
@@ -139,10 +139,10 @@ def _ready(judge: AutomaticJudge) -> UsableJudge:
     Raises:
         EvaError: If its set-up is invalid, or its address is not allowed.
     """
-    found = build_judge(judge.name, judge.kind, judge.setup)
-    if found.served and judge.allowed_address != judge.address:
+    usable = build_judge(judge.name, judge.kind, judge.setup)
+    if usable.served and judge.allowed_address != judge.address:
         raise NotAllowed(_JUDGE_ADDRESS_NOT_ALLOWED_ADMINISTRATOR(judge=judge))
-    return found
+    return usable
 
 
 # --- judging -----------------------------------------------------------------------------------------------
@@ -156,75 +156,76 @@ def judge_next_trial(*, plan: Plan, name: str) -> bool:
     Raises:
         EvaError: If the judge itself fails; nothing is recorded.
     """
-    found = _ready(_judge(name))  # checked again for each trial: the permission may have been withdrawn
-    handout = next(_showable(plan, found), None)
+    judge = _ready(_judge(name))  # checked again for each trial: the permission may have been withdrawn
+    handout = next(_showable(plan, judge), None)
     if handout is None:
         return False
     run_checks("judged", handout.trial, None)
-    judgement = Judgement(trial=handout.trial, judge=found.name, version=found.version)
+    judgement = Judgement(trial=handout.trial, judge=judge.name, version=judge.version)
     milestones = list(handout.trial.scene.milestones.order_by("order"))
-    said = [MilestoneJudgement()] * len(milestones)
+    verdicts = [MilestoneJudgement()] * len(milestones)
     try:
-        case = _case(handout.trial, milestones, found)
-        words = found.prompt_text(case)
-        judgement.prompt = hashlib.sha256(words.encode()).hexdigest() if words else ""
+        case = _case(handout.trial, milestones, judge)
+        prompt = judge.prompt_text(case)
+        judgement.prompt = hashlib.sha256(prompt.encode()).hexdigest() if prompt else ""
         judgement.pictures = [
             [still.camera, still.at, hashlib.sha256(still.jpeg).hexdigest()] for still in case.stills
         ]
-        if found.pictures and not case.stills:
+        if judge.pictures and not case.stills:
             raise NoVerdict("there is no picture of it")
-        verdict = found.judge_case(case)
-        judgement.model, said = _short(verdict.model, LONGEST_MODEL), list(verdict.milestones)
+        verdict = judge.judge_case(case)
+        judgement.model, verdicts = _short(verdict.model, LONGEST_MODEL), list(verdict.milestones)
     except RecordingError:
         log.warning("judge %s: pictures of trial %s cannot be read", name, handout.trial_id, exc_info=True)
         judgement.reason = "its pictures cannot be read"
     except NoVerdict as none:
         judgement.reason = _short(str(none), LONGEST_REASON) or "it gave none"
     judgement.milestones = [
-        [row.text, one.reached, one.probability] for row, one in zip(milestones, said, strict=True)
+        [row.text, milestone_verdict.reached, milestone_verdict.probability]
+        for row, milestone_verdict in zip(milestones, verdicts, strict=True)
     ]
     _store_judgement(judgement)
     return True
 
 
-def _short(said: str, longest: int) -> str:
+def _short(text: str, longest: int) -> str:
     """Return a third party's text on one line, with characters that both databases accept, and truncated."""
-    return " ".join(said.replace("\x00", "").encode("utf-8", "replace").decode().split())[:longest]
+    return " ".join(text.replace("\x00", "").encode("utf-8", "replace").decode().split())[:longest]
 
 
 def unjudged_trials(*, plan: Plan, name: str) -> tuple[int, list[str]]:
     """Return the number of scored trials not shown to the judge, and the codes of those without images on
     this machine.
     """
-    found = _ready(_judge(name))
-    waiting = list(_waiting(plan, found))
-    return len(waiting), [row.code for row in waiting if not _has_evidence(row, found)]
+    judge = _ready(_judge(name))
+    waiting = list(_waiting(plan, judge))
+    return len(waiting), [row.code for row in waiting if not _has_evidence(row, judge)]
 
 
-def _waiting(plan: Plan, found: UsableJudge) -> Iterator[Handout]:
+def _waiting(plan: Plan, judge: UsableJudge) -> Iterator[Handout]:
     """Yield the trials that count, have milestones and were not shown to the judge, in order of allocation."""
-    shown = Judgement.objects.filter(trial=OuterRef("trial"), judge=found.name, version=found.version)
-    rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).exclude(Exists(shown))
+    judged = Judgement.objects.filter(trial=OuterRef("trial"), judge=judge.name, version=judge.version)
+    rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).exclude(Exists(judged))
     rows = rows.filter(Exists(Milestone.objects.filter(scene=OuterRef("trial__scene"))))
     yield from rows.select_related("trial__scene", "trial__episode").order_by("number")
 
 
-def _showable(plan: Plan, found: UsableJudge) -> Iterator[Handout]:
-    return (handout for handout in _waiting(plan, found) if _has_evidence(handout, found))
+def _showable(plan: Plan, judge: UsableJudge) -> Iterator[Handout]:
+    return (handout for handout in _waiting(plan, judge) if _has_evidence(handout, judge))
 
 
-def _has_evidence(handout: Handout, found: UsableJudge) -> bool:
-    return not found.pictures or is_watchable(handout.trial.episode)
+def _has_evidence(handout: Handout, judge: UsableJudge) -> bool:
+    return not judge.pictures or is_watchable(handout.trial.episode)
 
 
-def _case(trial: Trial, milestones: Sequence[Milestone], found: UsableJudge) -> TrialCase:
+def _case(trial: Trial, milestones: Sequence[Milestone], judge: UsableJudge) -> TrialCase:
     """Return the information about a trial that the judge may have."""
     return TrialCase(
         trial.instruction,
         trial.scene.criterion,
         tuple(MilestonePrompt(row.text, row.time_limit_s) for row in milestones),
-        trial_stills(trial.episode) if found.pictures and trial.episode is not None else (),
-        () if found.pictures else tuple(reached_in_truth(trial.truth or {}, row) for row in milestones),
+        trial_stills(trial.episode) if judge.pictures and trial.episode is not None else (),
+        () if judge.pictures else tuple(reached_in_truth(trial.truth or {}, row) for row in milestones),
     )
 
 

@@ -42,8 +42,8 @@ def require_video(*handouts: Handout) -> None:
     """Raise Conflict, with the reason for each trial, if trials have no video."""
     blind = [handout for handout in handouts if not is_watchable(handout.trial.episode)]
     if blind:
-        told = "; ".join(f"{handout.code}: {_why(handout.trial.episode)}" for handout in blind)
-        raise Conflict(_WITHOUT_PICTURES_NOBODY_CAN_JUDGE(told=told))
+        reasons = "; ".join(f"{handout.code}: {_why(handout.trial.episode)}" for handout in blind)
+        raise Conflict(_WITHOUT_PICTURES_NOBODY_CAN_JUDGE(told=reasons))
 
 
 def _why(episode: Episode | None) -> str:
@@ -65,7 +65,7 @@ def trial_stills(episode: Episode) -> tuple[StillImage, ...]:
     Raises:
         RecordingError: If a video is damaged.
     """
-    found = []
+    stills = []
     for number, camera in enumerate(episode.cameras[:CAMERAS], 1):
         video = video_file(episode.uuid, camera)
         if not video.exists():  # the camera failed before its first image
@@ -75,8 +75,8 @@ def trial_stills(episode: Episode) -> tuple[StillImage, ...]:
             for index in sample(len(pictures)):
                 pixels = pictures[index]
                 jpeg = jpeg_of(pixels, min(WIDTH, pixels.shape[1]))
-                found.append(StillImage(f"camera {number}", round(times[index] - times[0], 3), jpeg))
-    return tuple(found)
+                stills.append(StillImage(f"camera {number}", round(times[index] - times[0], 3), jpeg))
+    return tuple(stills)
 
 
 def sample(n: int, most: int = OF_EACH) -> list[int]:

@@ -120,16 +120,16 @@ def next_to_rate(user: User) -> NextItem[Handout]:
     return _offered(mine, len(mine), lambda handout: (handout,))
 
 
-def _rated_first(what: str, trial: Trial, user: User) -> None:
+def _rated_first(change: str, trial: Trial, user: User) -> None:
     """Refuse to let a potential second rater of the trial correct the wording of its score.
 
     Correcting first would disqualify them as a rater, and mostly for failures; and a rater must not know the score's
     wording.
 
     Raises:
-        NotAllowed: If `what` is "reworded" and the user may still be asked to rate the trial.
+        NotAllowed: If `change` is "reworded" and the user may still be asked to rate the trial.
     """
-    if what != "reworded":
+    if change != "reworded":
         return
     if any(_still_rates(user, plan, trial) for plan in Plan.objects.filter(handouts__trial=trial)):
         raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
@@ -162,12 +162,12 @@ def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, 
     `of` gives the trials of an item; the codes of trials whose images are missing are returned as `passed`. `waiting`
     is read no further than necessary.
     """
-    for there, each in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
+    for is_present, items in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
         passed: list[str] = []
-        for one in each:
-            lacking = [handout.code for handout in of(one) if not there(handout.trial.episode)]
+        for item in items:
+            lacking = [handout.code for handout in of(item) if not is_present(handout.trial.episode)]
             if not lacking:
-                return NextItem(one, count, tuple(dict.fromkeys(passed)))
+                return NextItem(item, count, tuple(dict.fromkeys(passed)))
             passed += lacking
     return NextItem(None, count, tuple(dict.fromkeys(passed)))
 
@@ -207,26 +207,26 @@ def save_rating(
     if trial.operator_id == user.pk or trial.scores.filter(rater=user).exists():
         raise NotAllowed(_YOU_RAN_SCORED_TRIAL_SOMEONE(code=code))
     run_checks("judged", trial, user)
-    twice = f"you have rated trial {code} already"
+    repeat_text = f"you have rated trial {code} already"
     fails = bool(failing(trial))
-    found = score_outcome(list(trial.scene.milestones.order_by("order")), milestones, success, fails=fails)
-    said = {
-        "success": found.success,
-        "score": found.score,
-        "milestones": [[row[0].text, row[1]] for row in found.reached],
+    outcome = score_outcome(list(trial.scene.milestones.order_by("order")), milestones, success, fails=fails)
+    values = {
+        "success": outcome.success,
+        "score": outcome.score,
+        "milestones": [[row[0].text, row[1]] for row in outcome.reached],
         **failures.clean_failure(failure_phase=failure_phase, failure=failure),
         "note": clean_text("note", note, LONGEST_NOTE),
     }
     before = Rating.objects.filter(trial=trial, rater=user).first()
     if before is not None:
-        return _is_repeat(before, said, twice)
+        return _is_repeat(before, values, repeat_text)
     if has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_SECOND(plan=plan))
-    failures.check_failure(trial.scene, said, success=found.success)
+    failures.check_failure(trial.scene, values, success=outcome.success)
     require_video(handout)
-    rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
+    rating = Rating(trial=trial, rater=user, blind=plan.sealed, **values)
     RATINGS.append(journal_uuid(trial), RatingLine.written(rating))
-    return _once(rating, twice)
+    return _once(rating, repeat_text)
 
 
 def next_to_compare(user: User, plans: Iterable[Plan] | None = None) -> NextItem[Pair]:
@@ -254,7 +254,11 @@ def _pairs(plan: Plan) -> list[tuple[int, int]]:
         blocks[block].append((trial, status))
     gone = EpisodeStatus.MISSING
     neighbours = (pair for block in blocks.values() for pair in pairwise(block))
-    return [(one, other) for (one, at), (other, there) in neighbours if gone not in (at, there)]
+    return [
+        (first, second)
+        for (first, at), (second, second_status) in neighbours
+        if gone not in (at, second_status)
+    ]
 
 
 def _named(plan: Plan, pairs: Sequence[tuple[int, int]]) -> list[Pair]:
@@ -282,20 +286,29 @@ def save_preference(*, user: User, plan: Plan, first: str, second: str, outcome:
     reason = clean_text("why", why, LONGEST_NOTE)
     if not reason:
         raise EvaError(_WHY_EMPTY_SAY_SENTENCE_OTHERS)
-    one, other = _handout(plan, first), _handout(plan, second)
-    if (one.trial_id, other.trial_id) not in _pairs(plan):
+    first_handout, second_handout = _handout(plan, first), _handout(plan, second)
+    if (first_handout.trial_id, second_handout.trial_id) not in _pairs(plan):
         raise Conflict(_WERE_NOT_RUN_ONE_AFTER(first=first, second=second))
-    twice = f"you have compared {first} and {second} already"
-    said = {"outcome": outcome, "why": reason}
-    before = Preference.objects.filter(first=one.trial, second=other.trial, rater=user).first()
+    repeat_text = f"you have compared {first} and {second} already"
+    values = {"outcome": outcome, "why": reason}
+    before = Preference.objects.filter(
+        first=first_handout.trial, second=second_handout.trial, rater=user
+    ).first()
     if before is not None:
-        return _is_repeat(before, said, twice)
+        return _is_repeat(before, values, repeat_text)
     if has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_RATER(plan=plan))
-    require_video(one, other)
-    row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)
-    RATINGS.append(journal_uuid(other.trial), PreferenceLine.written(row))
-    return _once(row, twice)
+    require_video(first_handout, second_handout)
+    row = Preference(
+        plan=plan,
+        first=first_handout.trial,
+        second=second_handout.trial,
+        rater=user,
+        blind=plan.sealed,
+        **values,
+    )
+    RATINGS.append(journal_uuid(second_handout.trial), PreferenceLine.written(row))
+    return _once(row, repeat_text)
 
 
 def _handout(plan: Plan, code: str) -> Handout:
@@ -303,28 +316,28 @@ def _handout(plan: Plan, code: str) -> Handout:
     writes its journal.
     """
     rows = plan.handouts.select_related("slot", "trial__scene", "trial__episode")
-    found = rows.filter(code=code).first()
-    if found is None:
+    handout = rows.filter(code=code).first()
+    if handout is None:
         raise NotFound(_HAS_NO_TRIAL(plan=plan, code=code))
-    found.trial.status = Trial.objects.select_for_update().get(pk=found.trial_id).status
-    return found
+    handout.trial.status = Trial.objects.select_for_update().get(pk=handout.trial_id).status
+    return handout
 
 
-def _is_repeat(before: T, said: Mapping[str, Any], twice: str) -> T:
+def _is_repeat(before: T, values: Mapping[str, Any], repeat_text: str) -> T:
     """Return the earlier answer `before`, because the same answer was sent again, as after a lost reply.
 
     Raises:
         Conflict: If the new answer differs.
     """
-    if any(getattr(before, name) != value for name, value in said.items()):
-        raise Conflict(_OTHERWISE_WHAT_SAID_STANDS(twice=twice))
+    if any(getattr(before, name) != value for name, value in values.items()):
+        raise Conflict(_OTHERWISE_WHAT_SAID_STANDS(twice=repeat_text))
     return before
 
 
-def _once(row: Any, twice: str) -> Any:
+def _once(row: Any, repeat_text: str) -> Any:
     try:
         with transaction.atomic():
             row.save()
     except IntegrityError:
-        raise Conflict(twice) from None
+        raise Conflict(repeat_text) from None
     return row

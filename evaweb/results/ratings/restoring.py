@@ -25,28 +25,28 @@ _JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE = Pattern(
 @register_restorer
 def restore(kept: RestorableRun) -> int:
     """Create the missing rows and return their number; the trials must have been restored before."""
-    made = 0
+    count = 0
     for line in kept.lines:
         try:
             if isinstance(line, RatingLine):
-                made += _rating(line)
+                count += _rating(line)
             elif isinstance(line, PreferenceLine):
-                made += _preference(line)
+                count += _preference(line)
             elif isinstance(line, JudgementLine):
-                made += _judgement(line)
+                count += _judgement(line)
         except (EvaError, DataError, IntegrityError) as error:
             kept.report_problem(f"run {kept.uuid}: its {line.kind} {line.uuid}: {error}")
-    return made
+    return count
 
 
 @transaction.atomic
 def _rating(line: RatingLine) -> bool:
     if Rating.objects.filter(uuid=line.uuid).exists():
         return False
-    trial, said = _trial(line.trial), line.to_row_values()
-    if Rating.objects.filter(trial=trial, rater=said["rater"]).exists():
+    trial, values = _trial(line.trial), line.to_row_values()
+    if Rating.objects.filter(trial=trial, rater=values["rater"]).exists():
         return False  # written twice, of which the database accepted one
-    Rating.objects.create(trial=trial, **said)
+    Rating.objects.create(trial=trial, **values)
     return True
 
 
@@ -54,13 +54,13 @@ def _rating(line: RatingLine) -> bool:
 def _preference(line: PreferenceLine) -> bool:
     if Preference.objects.filter(uuid=line.uuid).exists():
         return False
-    first, second, said = _trial(line.first), _trial(line.second), line.to_row_values()
-    if Preference.objects.filter(first=first, second=second, rater=said["rater"]).exists():
+    first, second, values = _trial(line.first), _trial(line.second), line.to_row_values()
+    if Preference.objects.filter(first=first, second=second, rater=values["rater"]).exists():
         return False
     plan = Plan.objects.filter(name=line.plan, version=line.version).first()
     if plan is None:
         log.warning("preference %s is of plan %s v%d, which is lost", line.uuid, line.plan, line.version)
-    Preference.objects.create(plan=plan, first=first, second=second, **said)
+    Preference.objects.create(plan=plan, first=first, second=second, **values)
     return True
 
 
@@ -68,15 +68,15 @@ def _preference(line: PreferenceLine) -> bool:
 def _judgement(line: JudgementLine) -> bool:
     if Judgement.objects.filter(uuid=line.uuid).exists():
         return False
-    trial, said = _trial(line.trial), line.to_row_values()
+    trial, values = _trial(line.trial), line.to_row_values()
     if Judgement.objects.filter(trial=trial, judge=line.judge, version=line.version).exists():
         return False
-    Judgement.objects.create(trial=trial, **said)
+    Judgement.objects.create(trial=trial, **values)
     return True
 
 
 def _trial(facts: TrialRecord) -> Trial:
-    found = Trial.objects.filter(uuid=facts.uuid).first()
-    if found is None:
+    trial = Trial.objects.filter(uuid=facts.uuid).first()
+    if trial is None:
         raise EvaError(_JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE(uuid=facts.uuid))
-    return found
+    return trial

@@ -14,11 +14,11 @@ def sealed_reason(plan: Plan, user: Any, sight: Visibility | None = None) -> str
     """Return why this user may see no results of the plan, "" if they may."""
     if is_sealed_for(plan, user):
         return f"{plan} is blind until it is revealed"
-    others = sealing_plans(plan, user, sight)
-    if not others:
+    plans = sealing_plans(plan, user, sight)
+    if not plans:
         return ""
-    names = plan_titles(others)
-    which = names if len(others) == 1 else f"one or more of {names}"
+    names = plan_titles(plans)
+    which = names if len(plans) == 1 else f"one or more of {names}"
     return f"checkpoints of {plan} are compared blind in {which}: what it found is shown after that reveal"
 
 
@@ -28,17 +28,19 @@ def sealing_plans(plan: Plan, user: Any, sight: Visibility | None = None) -> lis
     [] if they are visible. All blind plans are returned, not only those that share a checkpoint: a selection would
     reveal what they compare.
     """
-    seen = sight or visibility_for_user(user)
-    if is_sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=seen.checkpoints).exists():
+    visibility = sight or visibility_for_user(user)
+    if is_sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=visibility.checkpoints).exists():
         return []
-    return list(Plan.objects.filter(pk__in=seen.keys).select_related("owner").order_by("title", "-version"))
+    return list(
+        Plan.objects.filter(pk__in=visibility.keys).select_related("owner").order_by("title", "-version")
+    )
 
 
 def require_visible_results(plan: Plan, user: Any) -> None:
     """Raise NotAllowed if the user may not see results of the plan."""
-    why = sealed_reason(plan, user)
-    if why:
-        raise NotAllowed(why)
+    reason = sealed_reason(plan, user)
+    if reason:
+        raise NotAllowed(reason)
 
 
 def has_results(plan: Plan) -> bool:

@@ -54,22 +54,24 @@ def checklist(result: PlanResult) -> list[Item]:
     ]
 
 
-def _yes_or_no(kept: bool) -> str:
-    return "yes" if kept else "no"
+def _yes_or_no(fulfilled: bool) -> str:
+    return "yes" if fulfilled else "no"
 
 
 def _preregistration(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     begun = trials.aggregate(first=Min("prepared_at"))["first"]
     before = bool(plan.frozen_at and (begun is None or plan.frozen_at <= begun))
     names = compared(plan.document or {})
-    said = bool(plan.question.strip() and names)
-    kept = "yes" if before and said else "partly" if before else "no"
-    words = plan.question.strip() or "no question was written down"
-    told = "; ".join(f"compares {first} and {second}" for first, second in names) or "names no comparison"
+    complete = bool(plan.question.strip() and names)
+    verdict = "yes" if before and complete else "partly" if before else "no"
+    question = plan.question.strip() or "no question was written down"
+    comparisons = (
+        "; ".join(f"compares {first} and {second}" for first, second in names) or "names no comparison"
+    )
     return Item(
         "Question and comparison before the first trial",
-        kept,
-        f"“{words}”; {told}; frozen {plan.frozen_at:%Y-%m-%d %H:%M} UTC",
+        verdict,
+        f"“{question}”; {comparisons}; frozen {plan.frozen_at:%Y-%m-%d %H:%M} UTC",
     )
 
 
@@ -77,10 +79,10 @@ def _criteria(plan: Plan) -> Item:
     scenes = (plan.document or {})["scenes"]
     written = sum(bool(scene["criterion"].strip()) for scene in scenes)
     stones = sum(bool(scene["milestones"]) for scene in scenes)
-    kept = "yes" if written == stones == len(scenes) else "partly" if written or stones else "no"
+    verdict = "yes" if written == stones == len(scenes) else "partly" if written or stones else "no"
     return Item(
         "Criteria of success and milestones written down",
-        kept,
+        verdict,
         f"{written} of {len(scenes)} scenes have a criterion, {stones} have milestones",
     )
 
@@ -106,13 +108,13 @@ def _blind(plan: Plan) -> Item:
         row["by_name"] + ("" if row["own"] else f" (at {row['name']} v{row['version']})")
         for row in looked_behind(plan)
     ]
-    words = (
+    text = (
         f"looked before the reveal: {', '.join(looked)}; they ran no trial from then on, "
         "but they could still stand by or press an e-stop"
         if looked
         else "no looks before the reveal"
     )
-    return Item("Operators blind", "partly" if looked else "yes", f"a fresh code for every trial; {words}")
+    return Item("Operators blind", "partly" if looked else "yes", f"a fresh code for every trial; {text}")
 
 
 def _complete(result: PlanResult, trials) -> Item:  # type: ignore[no-untyped-def]
@@ -120,11 +122,11 @@ def _complete(result: PlanResult, trials) -> Item:  # type: ignore[no-untyped-de
     foreseen, counted = plan.slots.count(), trials.filter(status=TrialStatus.SCORED).count()
     rule = plan.get_stopping_display()
     ended = result.design is not None and findings(result.design, result.blocks).ended
-    kept = "yes" if counted == foreseen or ended else "partly"
+    verdict = "yes" if counted == foreseen or ended else "partly"
     closed = f"; closed because: {plan.closed_because}" if plan.closed_because else ""
     return Item(
         "As many trials as planned, or a rule to stop",
-        kept,
+        verdict,
         f"{counted} of {foreseen} count; {rule}{closed}",
     )
 
@@ -132,8 +134,8 @@ def _complete(result: PlanResult, trials) -> Item:  # type: ignore[no-untyped-de
 def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     voided = trials.filter(status=TrialStatus.VOIDED)
     late = voided.filter(voided_at__gte=plan.stored_at).count() if plan.stored_at else 0
-    words = f"{voided.count()} voided in this version, each with a reason, {late} of them after the reveal"
-    return Item("No trial of this version voided after the reveal", _yes_or_no(late == 0), words)
+    text = f"{voided.count()} voided in this version, each with a reason, {late} of them after the reveal"
+    return Item("No trial of this version voided after the reveal", _yes_or_no(late == 0), text)
 
 
 def _corrections(plan: Plan) -> Item:
@@ -142,14 +144,14 @@ def _corrections(plan: Plan) -> Item:
     corrected = sum(bool(row["why"]) for row in rows if row["changed"] == VERDICT)
     late = Counter(row["changed"] for row in rows if plan.stored_at and row["at"] > plan.stored_at)
     categories = sum(row["changed"] == CATEGORY for row in rows)
-    words = (
+    text = (
         f"{corrected} corrections, each a row of its own with author and reason, {late[VERDICT]} scores after the "
         "reveal"
     )
     if categories:
-        words += f"; failure categories alone corrected {categories} times, {late[CATEGORY]} of them after the reveal"
-    kept = "no" if late[VERDICT] else "partly" if corrected else "yes"
-    return Item("Scores kept as they were given", kept, words)
+        text += f"; failure categories alone corrected {categories} times, {late[CATEGORY]} of them after the reveal"
+    verdict = "no" if late[VERDICT] else "partly" if corrected else "yes"
+    return Item("Scores kept as they were given", verdict, text)
 
 
 def _versions(plan: Plan) -> Item:
@@ -157,10 +159,10 @@ def _versions(plan: Plan) -> Item:
     while version is not None:
         before, left = before + bool(version.document), left + version.handouts.count()
         version = version.amends
-    words = f"version {plan.version}; {before} frozen before it"
+    text = f"version {plan.version}; {before} frozen before it"
     if before:
-        words += f", each with all of its alpha; their {left} attempts are not in these data"
-    return Item("One version of the plan", _yes_or_no(before == 0), words)
+        text += f", each with all of its alpha; their {left} attempts are not in these data"
+    return Item("One version of the plan", _yes_or_no(before == 0), text)
 
 
 def _second_rater(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
@@ -171,25 +173,25 @@ def _second_rater(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
         .count()
     )
     n = trials.filter(status=TrialStatus.SCORED).count()
-    wanted = round(plan.second_rater_share * n)
-    kept = "yes" if rated and rated >= wanted else "partly" if rated else "no"
+    target = round(plan.second_rater_share * n)
+    verdict = "yes" if rated and rated >= target else "partly" if rated else "no"
     return Item(
-        "A second, blind rater", kept, f"{rated} of {n} trials were rated again; planned were {wanted}"
+        "A second, blind rater", verdict, f"{rated} of {n} trials were rated again; planned were {target}"
     )
 
 
 def _narrative(analysis: Analysis) -> Item:
     failed = sum(arm.success.n - arm.success.successes for arm in analysis.arms)
     named = sum(m.count for arm in analysis.arms for m in arm.failures if m.phase or m.cause)
-    kept = "yes" if named == failed else "partly" if named else "no"
-    return Item("Why trials failed", kept, f"{named} of {failed} failures have a reason")
+    verdict = "yes" if named == failed else "partly" if named else "no"
+    return Item("Why trials failed", verdict, f"{named} of {failed} failures have a reason")
 
 
 def _recorded(trials) -> Item:  # type: ignore[no-untyped-def]
     counted = trials.filter(status=TrialStatus.SCORED)
     n, recorded = counted.count(), counted.filter(episode__isnull=False).count()
-    kept = "yes" if recorded == n else "partly" if recorded else "no"
-    return Item("Every trial that counts recorded", kept, f"{recorded} of {n} have a recording")
+    verdict = "yes" if recorded == n else "partly" if recorded else "no"
+    return Item("Every trial that counts recorded", verdict, f"{recorded} of {n} have a recording")
 
 
 def _configurations(trials) -> Item:  # type: ignore[no-untyped-def]
@@ -201,8 +203,8 @@ def _configurations(trials) -> Item:  # type: ignore[no-untyped-def]
     changed = [row for row in rows if row["n"] > 1]
     if not rows:
         return Item("One configuration throughout", "no", "no recording says which it was")
-    words = f"{len(changed)} of {len(rows)} combinations of checkpoint and station had more than one"
-    return Item("One configuration throughout", "yes" if not changed else "partly", words)
+    text = f"{len(changed)} of {len(rows)} combinations of checkpoint and station had more than one"
+    return Item("One configuration throughout", "yes" if not changed else "partly", text)
 
 
 def _spread(trials) -> Item:  # type: ignore[no-untyped-def]
@@ -212,7 +214,7 @@ def _spread(trials) -> Item:  # type: ignore[no-untyped-def]
         operators=Count("operator", distinct=True),
         days=Count(F("started_at__date"), distinct=True),
     )
-    words = "{conditions} initial conditions, {stations} stations, {operators} operators, {days} days".format(
+    text = "{conditions} initial conditions, {stations} stations, {operators} operators, {days} days".format(
         **counted
     )
-    return Item("Tried under different conditions", _yes_or_no(counted["conditions"] > 1), words)
+    return Item("Tried under different conditions", _yes_or_no(counted["conditions"] > 1), text)

@@ -102,48 +102,54 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
 def report_numbers(result: PlanResult) -> dict[str, Any]:
     """Return every number of the report that the program recomputes."""
     preferred = result.preferences
-    words = ("reason", "groups")
+    text_fields = ("reason", "groups")
     return {
         **result.analysis.document,
         "planned": planned_document(result),
         "agreement": result.agreement,
         "judges": result.judges,
-        "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
+        "preferences": preferred
+        and {name: value for name, value in preferred.items() if name not in text_fields},
     }
 
 
 def planned_document(result: PlanResult) -> list[dict[str, Any]]:
     """Return the conclusion of the plan's design for each comparison."""
-    found, blocks = result.design, result.blocks
-    if found is None:
+    design, blocks = result.design, result.blocks
+    if design is None:
         return []
     return [
         {
             "first": names[0],
             "second": names[1],
-            "blocks": one.blocks,
-            "at": one.ended_at_pair,
-            "winner": {"first": names[0], "second": names[1], None: None}[one.winner],
-            "p": one.p,
-            "estimate": _estimate(estimated(found, blocks, pair, one)),
+            "blocks": conclusion.blocks,
+            "at": conclusion.ended_at_pair,
+            "winner": {"first": names[0], "second": names[1], None: None}[conclusion.winner],
+            "p": conclusion.p,
+            "estimate": _estimate(estimated(design, blocks, pair, conclusion)),
         }
-        for names, pair, one in zip(
-            compared(result.plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True
+        for names, pair, conclusion in zip(
+            compared(result.plan.document or {}),
+            design.comparisons,
+            findings(design, blocks).each,
+            strict=True,
         )
     ]
 
 
-def _estimate(found: Difference | None) -> list[float] | None:
-    return None if found is None else [found.value, found.interval.low, found.interval.high]
+def _estimate(difference: Difference | None) -> list[float] | None:
+    return (
+        None if difference is None else [difference.value, difference.interval.low, difference.interval.high]
+    )
 
 
 def plan_seal(plan: Plan) -> dict[str, Any]:
     """Return digest and commitment, and the key if it was revealed."""
-    shown = plan.state == PlanState.REVEALED or plan.at_reveal is not None
+    visible = plan.state == PlanState.REVEALED or plan.at_reveal is not None
     return {
         "digest": plan.digest,
         "commitment": plan.commitment,
-        "key": bytes(plan.key or b"").hex() if shown else "",
+        "key": bytes(plan.key or b"").hex() if visible else "",
         "at_reveal": plan.at_reveal,
     }
 
@@ -163,25 +169,25 @@ def report_context(result: PlanResult) -> dict[str, Any]:
         "ends": _ends(plan.document or {}),
         "changes": checkpoint_changes(plan),
         "headline": result.headline,
-        "primaries": [facts.comparison_facts(result, found) for found in primaries],
+        "primaries": [facts.comparison_facts(result, comparison) for comparison in primaries],
         "columns": ARM_COLUMNS,
         "table": listings.arm_rows(result),
         "others": [
-            (found, facts.comparison_sentence(analysis, found))
-            for found in analysis.comparisons
-            if found not in primaries
+            (comparison, facts.comparison_sentence(analysis, comparison))
+            for comparison in analysis.comparisons
+            if comparison not in primaries
         ],
         **draw_arms(analysis.arms, analysis.letters, lambda **named: "", mixed=True),
         "failures": listings.failure_tables(analysis, ordered_terms(), lambda **named: ""),
         "evidence": [
             time_courses.draw_evidence(
-                found.evidence,
-                found.first,
-                found.second,
-                drawn=(order[found.first], order[found.second]),
+                comparison.evidence,
+                comparison.first,
+                comparison.second,
+                drawn=(order[comparison.first], order[comparison.second]),
             )
-            for found in primaries
-            if found.pairs and found.evidence
+            for comparison in primaries
+            if comparison.pairs and comparison.evidence
         ],
         "agreement": result.agreement,
         "judges": result.judges,
@@ -194,19 +200,19 @@ def report_context(result: PlanResult) -> dict[str, Any]:
 
 def _ends(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return (kind of abnormal end, what it counts as) as texts, for each kind that the plan decides."""
-    said = document.get("counts_as", {})
-    return [(words, CountsAs(said[name]).label) for name, words in ENDS.items() if name in said]
+    counts_as = document.get("counts_as", {})
+    return [(label, CountsAs(counts_as[name]).label) for name, label in ENDS.items() if name in counts_as]
 
 
 def _bench_images(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
     """Return by trial the images of its cameras that are in the report."""
-    there = {path.stem for path in folder.glob("*.jpg")}
-    found: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    stems = {path.stem for path in folder.glob("*.jpg")}
+    by_trial: dict[int, list[dict[str, Any]]] = defaultdict(list)
     for row in (row for page in laid_out.layout_rows(plan) for row in page):
-        if row["picture"] in there:
-            known = row["reference"] if row["reference"] in there else ""
-            found[row["trial"]].append({**row, "reference": known})
-    return dict(found)
+        if row["picture"] in stems:
+            reference = row["reference"] if row["reference"] in stems else ""
+            by_trial[row["trial"]].append({**row, "reference": reference})
+    return dict(by_trial)
 
 
 def _styles() -> str:
@@ -214,10 +220,10 @@ def _styles() -> str:
 
 
 def _style(name: str) -> str:
-    found = finders.find(name)
-    if not isinstance(found, str):
+    path = finders.find(name)
+    if not isinstance(path, str):
         raise EvaError(_STYLE_SHEET_NOT_WHERE_INSTALLED(name=name))
-    return Path(found).read_text("utf-8")
+    return Path(path).read_text("utf-8")
 
 
 def _json(path: Path, content: Mapping[str, Any]) -> None:

@@ -63,10 +63,10 @@ def _judged(plan: Plan) -> dict[str, list[list[str]]]:
 
 def _conduct(result: PlanResult) -> dict[str, Any]:
     """Return the parts of the integrity document that later corrections do not change, as JSON."""
-    found: dict[str, Any] = json.loads(
+    conduct: dict[str, Any] = json.loads(
         json.dumps({name: result.conduct[name] for name in STAYS}, default=datetime.isoformat)
     )
-    return found
+    return conduct
 
 
 def _attempts(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:

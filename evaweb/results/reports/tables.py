@@ -97,46 +97,52 @@ def outcome_page(result: PlanResult, offset: int, limit: int) -> dict[str, Any]:
 
 def _attempts(result: PlanResult) -> QuerySet[Trial]:
     only = result.only
-    wanted = {
+    filters = {
         "scene__name": only.scene,
         "position__number": only.position,
         "station__name": only.station,
         "operator__username": only.operator,
     }
     rows = Trial.objects.filter(evaluation=result.plan.evaluation_id, handout__isnull=False)
-    return rows.filter(**{name: value for name, value in wanted.items() if value}).order_by("handout__number")
+    return rows.filter(**{name: value for name, value in filters.items() if value}).order_by(
+        "handout__number"
+    )
 
 
 def _rows(result: PlanResult, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
-    said, found = result.headline.sentence if result.headline else "", []
-    for *row, kept, recording, frames in attempts.values_list(
+    sentence, records = result.headline.sentence if result.headline else "", []
+    for *row, stored_end, recording, frames in attempts.values_list(
         *_FIELDS, "ended_by", "episode__status", "episode__frames"
     ):
-        told = dict(zip(_ORDER, row, strict=True))
-        voided = told["status"] == TrialStatus.VOIDED  # its reason is a person's
-        end = "" if voided and kept is None else end_of(kept, told["status"], told["reason"], recording)
-        found.append(told | {"headline": said, "ended_by": end, "frames": frames})
-    reached = milestones_of([row["milestones"] for row in found if row["milestones"]])
-    for row in found:
+        values = dict(zip(_ORDER, row, strict=True))
+        voided = values["status"] == TrialStatus.VOIDED  # its reason is a person's
+        end = (
+            ""
+            if voided and stored_end is None
+            else end_of(stored_end, values["status"], values["reason"], recording)
+        )
+        records.append(values | {"headline": sentence, "ended_by": end, "frames": frames})
+    reached = milestones_of([row["milestones"] for row in records if row["milestones"]])
+    for row in records:
         row["milestones"] = json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)
         row |= {name: str(row[name]) for name in _TEXTS if row[name] is not None}
-    return found
+    return records
 
 
 def milestones_of(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
     """Return by score the milestones and whether each was reached, in order."""
-    found: dict[int, list[tuple[str, bool]]] = defaultdict(list)
+    by_score: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows = MilestoneOutcome.objects.filter(score__in=scores).order_by("score_id", "order")
     for score, text, reached in rows.values_list("score_id", "text", "reached"):
-        found[score].append((text, reached))
-    return found
+        by_score[score].append((text, reached))
+    return by_score
 
 
 def score_pages(plan: Plan) -> Iterator[list[dict[str, Any]]]:
     """Yield every score of the plan's trials in the order in which they were given, in pages."""
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
-    known = {"trial": "trial_id", "rater": "rater__username", "milestones": "pk"}
-    fields = [known.get(name, name) for name in SCORE_COLUMNS]
+    lookups = {"trial": "trial_id", "rater": "rater__username", "milestones": "pk"}
+    fields = [lookups.get(name, name) for name in SCORE_COLUMNS]
     for page in in_pages(dict(zip(SCORE_COLUMNS, row, strict=True)) for row in rows.values_list(*fields)):
         reached = milestones_of([row["milestones"] for row in page])
         yield [

@@ -68,8 +68,8 @@ def p_value_text(p: float) -> str:
 @register.filter
 def outcome_text(run: Outcome) -> str:
     """Return success or failure with its cause, and the share of points if it is neither 0 nor 1."""
-    said = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
-    return f"{said}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else said
+    text = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
+    return f"{text}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else text
 
 
 @register.filter
@@ -114,7 +114,7 @@ def count_and_list(found: list[Any], what: str) -> str:
     """Return the number of items and the names of the first ones; `what` is the noun that precedes the names."""
     if not found:
         return "none"
-    names = ", ".join(str(each) for each in found[:_MOST_NAMED])
+    names = ", ".join(str(item) for item in found[:_MOST_NAMED])
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
     return f"{len(found)} ({what}{'s' * (len(found) > 1)} {names}{more})"
 

@@ -35,17 +35,17 @@ _LABELS = {"failure_phase": "Phase", "failure": "Cause"}
 @register.simple_tag(takes_context=True)
 def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
     """Return the active filters among `names`: each as text (`words`), with the query string without it (`without`)."""
-    given = context["request"].GET
+    query = context["request"].GET
     chips = []
     for name in names.split():
-        if value := given.get(name, "").strip():
-            left = given.copy()
+        if value := query.get(name, "").strip():
+            left = query.copy()
             for key in [key for key in left if key in (name, "page") or not left[key]]:
                 del left[key]
-            known = name == "evaluation" and value.isdecimal() and len(value) < 16
-            said = Evaluation.objects.filter(pk=value).first() if known else value
+            is_key = name == "evaluation" and value.isdecimal() and len(value) < 16
+            text = Evaluation.objects.filter(pk=value).first() if is_key else value
             chips.append(
-                {"words": f"{_LABELS.get(name, name.capitalize())}: {said}", "without": left.urlencode()}
+                {"words": f"{_LABELS.get(name, name.capitalize())}: {text}", "without": left.urlencode()}
             )
     return chips
 
@@ -65,8 +65,8 @@ def mean_with_interval(found: Average | None, of: int) -> str:
 @register.filter
 def control_figures(control: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the timing figures of the control loop that the episode has: label, and value with unit."""
-    found = ((label, unit, control.get(key)) for key, (label, unit) in _CONTROL.items())
-    return [(label, f"{_short(value)} {unit}".strip()) for label, unit, value in found if value is not None]
+    figures = ((label, unit, control.get(key)) for key, (label, unit) in _CONTROL.items())
+    return [(label, f"{_short(value)} {unit}".strip()) for label, unit, value in figures if value is not None]
 
 
 _CONTROL = {

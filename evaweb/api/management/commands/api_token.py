@@ -28,8 +28,8 @@ class Command(BaseCommand):
         """Print the token and nothing else."""
         user = User.objects.filter(username=options["user"]).first()
         if user is None:
-            known = ", ".join(User.objects.values_list("username", flat=True)) or "none yet"
-            raise CommandError(f"user {options['user']!r} does not exist; there are: {known}")
+            names = ", ".join(User.objects.values_list("username", flat=True)) or "none yet"
+            raise CommandError(f"user {options['user']!r} does not exist; there are: {names}")
         try:
             self.stdout.write(create_token(user=user, name=options["name"], days=options["days"]))
         except EvaError as fault:

@@ -46,17 +46,17 @@ class Command(BaseCommand):
         from evaweb.serving.listeners import PortInUseError, open_listener
         from evaweb.serving.stop_port import StopPort
 
-        beside = None
+        stop_port = None
         try:
             if descriptor is not None:  # the lab that passed the socket publishes its address itself
                 listener = socket.socket(fileno=descriptor)
             else:
                 listener = open_listener(host, port)
-                beside = StopPort(listener.getsockname()[1], web_port)
+                stop_port = StopPort(listener.getsockname()[1], web_port)
         except PortInUseError as error:
             raise CommandError(str(error)) from None
         except OSError as error:
             raise CommandError(f"--descriptor {descriptor}: {error.strerror}; allowed: a socket's") from None
         server.serve(
-            stop_application(web_port), listener, beside=beside, lifeline=lifeline, request=StopRequest
+            stop_application(web_port), listener, beside=stop_port, lifeline=lifeline, request=StopRequest
         )

@@ -70,23 +70,23 @@ class Command(BaseCommand):
             raise CommandError("not all is well: see above", returncode=code)
 
     def _list(self, options: argparse.Namespace) -> int:
-        found = overviews()
-        for one in found:
-            if one.problem:
-                self.stdout.write(f"{one.name}: {one.problem}")
+        rows = overviews()
+        for row in rows:
+            if row.problem:
+                self.stdout.write(f"{row.name}: {row.problem}")
                 continue
-            checked = dataset_jobs.latest_check(one.name)
+            checked = dataset_jobs.latest_check(row.name)
             state = "not checked" if checked is None else _state(checked)
             self.stdout.write(
-                f"{one.name}: {one.version}, {one.robot or 'robot not said'}, {one.episodes} episodes, "
-                f"{one.frames} rows, {one.size / 1e6:.1f} MB, {state}"
+                f"{row.name}: {row.version}, {row.robot or 'robot not said'}, {row.episodes} episodes, "
+                f"{row.frames} rows, {row.size / 1e6:.1f} MB, {state}"
             )
-        if not found:
+        if not rows:
             self.stdout.write(f"there is no dataset below {data_dir()}")
-        return int(any(one.problem for one in found))
+        return int(any(row.problem for row in rows))
 
     def _import(self, options: argparse.Namespace) -> int:
-        done = import_dataset(
+        result = import_dataset(
             options.dataset,
             to=options.to,
             state=options.state,
@@ -95,9 +95,9 @@ class Command(BaseCommand):
             reencode=options.reencode,
             tell=self.stdout.write,
         )
-        for index, uuid in enumerate(done.episodes):
-            self.stdout.write(f"{uuid} is episode {index} of {done.dataset}")
-        self.stdout.write(f"imported: {len(done.episodes)} episodes, {done.made} of them new")
+        for index, uuid in enumerate(result.episodes):
+            self.stdout.write(f"{uuid} is episode {index} of {result.dataset}")
+        self.stdout.write(f"imported: {len(result.episodes)} episodes, {result.made} of them new")
         return 0
 
     def _publish(self, options: argparse.Namespace) -> int:
@@ -105,13 +105,13 @@ class Command(BaseCommand):
         for uuid in options.episodes:
             if not Episode.objects.filter(uuid=uuid).exists():
                 raise EvaError(f"episode {uuid} is not in the database: run manage.py reconcile")
-            done = publish_episode(JobContext({"uuid": str(uuid)}, self.stdout.write))
-            if done["published"]:
+            result = publish_episode(JobContext({"uuid": str(uuid)}, self.stdout.write))
+            if result["published"]:
                 self.stdout.write(
-                    f"{uuid} is episode {done['index']} of {done['dataset']}, {done['frames']} rows"
+                    f"{uuid} is episode {result['index']} of {result['dataset']}, {result['frames']} rows"
                 )
             else:
-                self.stderr.write(f"{uuid} is not published: {done['why']}")
+                self.stderr.write(f"{uuid} is not published: {result['why']}")
                 code = 1
         return code
 
@@ -122,11 +122,11 @@ def _state(checked: dataset_jobs.LatestCheck) -> str:
     return f"{len(checked.problems)} problems" if checked.problems else "whole"
 
 
-def _folder(given: str) -> Path:
+def _folder(name: str) -> Path:
     """Return the folder of a dataset name or path."""
-    if given.startswith(("/", ".")):
-        return Path(given)
+    if name.startswith(("/", ".")):
+        return Path(name)
     try:
-        return folder_named(full_name(given))
+        return folder_named(full_name(name))
     except EvaError as error:
         raise argparse.ArgumentTypeError(str(error)) from None

@@ -27,21 +27,21 @@ class Command(BaseCommand):
 
     def handle(self, *args: Any, **options: Any) -> None:
         try:
-            made = backup.make(options["folder"], keep=options["keep"], tell=self.stderr.write)
+            copy = backup.make(options["folder"], keep=options["keep"], tell=self.stderr.write)
         except BackupError as error:
             raise CommandError(str(error)) from None
-        files, database = made.about["files"], made.about["database"]
+        files, database = copy.about["files"], copy.about["database"]
         for folder in files["changing"]:
             self.stdout.write(
                 f"{folder} changed all the while: its files are of different moments; publish a dataset anew"
             )
         self.stdout.write(
-            f"{made.path}: {sum(database['rows'].values()):,} rows, {files['count']:,} files, "
+            f"{copy.path}: {sum(database['rows'].values()):,} rows, {files['count']:,} files, "
             f"{files['bytes']:,} bytes, {files['linked']:,} files shared with the backup before"
         )
 
 
-def _count(given: str) -> int:
-    if not (given.isascii() and given.isdecimal() and int(given)):
-        raise ArgumentTypeError(f"{given!r}; allowed: whole numbers from 1")
-    return int(given)
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and int(text)):
+        raise ArgumentTypeError(f"{text!r}; allowed: whole numbers from 1")
+    return int(text)

@@ -22,15 +22,15 @@ class Command(BaseCommand):
         parser.add_argument("--json", action="store_true", help="print the lines as JSON")
 
     def handle(self, *args: Any, **options: Any) -> None:
-        found = machine_check.lines()
+        lines = machine_check.lines()
         if options["json"]:
-            self.stdout.write(json.dumps([asdict(line) for line in found], indent=1))
+            self.stdout.write(json.dumps([asdict(line) for line in lines], indent=1))
         else:
-            for line in found:
+            for line in lines:
                 self.stdout.write(f"{line.state.upper():<10}{line.name}: {line.found}")
                 self.stdout.write(f"          {line.means}")
                 if line.advice:
                     self.stdout.write(f"          To do: {line.advice}")
-        bad = [line.name for line in found if line.state is State.BAD]
+        bad = [line.name for line in lines if line.state is State.BAD]
         if bad:
             raise CommandError(f"this will not work: {', '.join(bad)}")

@@ -177,8 +177,8 @@ class Command(BaseCommand):
             )
             for row in served
         ]
-        given = {"owner": "admin", "scene": demo_rows.demo_scene(), "checkpoints": checkpoints}
-        return demo_rows.demo_plan(name=name, title=title, repetitions=repetitions, **given, **design)
+        parts = {"owner": "admin", "scene": demo_rows.demo_scene(), "checkpoints": checkpoints}
+        return demo_rows.demo_plan(name=name, title=title, repetitions=repetitions, **parts, **design)
 
     def _welcome(self, url: str, logins: list[DemoLogin]) -> None:
         self.stdout.write(f"\nEVA Web is at {url}\n")
@@ -206,17 +206,17 @@ class Command(BaseCommand):
         visitors = [RestClient(url) for _ in logins]
         for visitor, login in zip(visitors, logins, strict=True):
             visitor.login(login.username, login.password)
-        made = plan_runner.run_plan(visitors[0], _STATION, name, count, self.stderr.write, progress)
+        completed = plan_runner.run_plan(visitors[0], _STATION, name, count, self.stderr.write, progress)
         with progress.during("the reveal, and what came out"):
-            result = plan_runner.close_and_reveal(visitors[1], name, made)
+            result = plan_runner.close_and_reveal(visitors[1], name, completed)
             plan.refresh_from_db()
             evaluated = PlanResult(plan)
-            found = evaluated.analysis
+            analysis = evaluated.analysis
         result["headline"] = evaluated.headline.sentence if evaluated.headline else ""
-        result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
+        result |= {"lockstep": True, "analysis": asdict(analysis), "wall_s": time.monotonic() - begun}
         if options["json"]:
             options["json"].write_text(json.dumps(to_json_value(result), indent=1), "utf-8")
-        for line in (*result_lines(found), result["headline"]):
+        for line in (*result_lines(analysis), result["headline"]):
             self.stdout.write(line)
 
     def _once(self, url: str, operator: DemoLogin, options: dict[str, Any]) -> None:
@@ -225,8 +225,8 @@ class Command(BaseCommand):
         choice = TrialChoice(
             _STATION, "block-on-plate", options["position"], options["checkpoint"], options["seed"]
         )
-        done = run_one_trial(visitor, choice)
-        text = json.dumps(report(done), indent=1)
+        completed = run_one_trial(visitor, choice)
+        text = json.dumps(report(completed), indent=1)
         if options["json"]:
             options["json"].write_text(text, "utf-8")
         self.stdout.write(text)
@@ -236,10 +236,11 @@ def result_lines(found: Analysis) -> Iterator[str]:
     """Yield a line per rate with its interval, a line per difference with its interval, and the notes."""
     for arm in found.arms:
         yield f"{arm.checkpoint}: {arm.success.successes}/{arm.success.n} {_percent(arm.success.interval)}"
-    for one in found.comparisons:
+    for comparison in found.comparisons:
         yield (
-            f"{one.first} against {one.second}: difference {100 * one.difference.value:.0f} points "
-            f"{_percent(one.difference.interval)}, {one.pairs} pairs"
+            f"{comparison.first} against {comparison.second}: "
+            f"difference {100 * comparison.difference.value:.0f} points "
+            f"{_percent(comparison.difference.interval)}, {comparison.pairs} pairs"
         )
     for note in found.notes:
         yield f"  {note}"

@@ -31,9 +31,9 @@ class Command(BaseCommand):
 
     def handle(self, *args: Any, **options: Any) -> None:
         path = options["out"].expanduser().absolute()
-        sight = FULL_VISIBILITY if options["unblinded"] else bundle.visibility_for(AnonymousUser())
+        visibility = FULL_VISIBILITY if options["unblinded"] else bundle.visibility_for(AnonymousUser())
         try:
-            notes = bundle.write(path, sight, lambda part: self.stderr.write(f"gathering {part}"))
+            notes = bundle.write(path, visibility, lambda part: self.stderr.write(f"gathering {part}"))
         except OSError as error:
             raise CommandError(
                 f"{path}: {error.strerror}; name a file in a folder that can be written"

@@ -47,10 +47,10 @@ class Command(BaseCommand):
             spoken = parse(file.stem, file.read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise CommandError(f"{file}: {error}") from None
-        found = {
+        parts = {
             "sentences": sentences.compared(entries["sentences"], spoken.patterns),
             "templates": sentences.compared(entries["templates"], spoken.templates),
         }
-        self.stdout.write(json.dumps(found, indent=1))
-        if any(part["unknown"] or part["other_arguments"] for part in found.values()):
+        self.stdout.write(json.dumps(parts, indent=1))
+        if any(part["unknown"] or part["other_arguments"] for part in parts.values()):
             raise CommandError(f"{file}: sentences that are unknown, or have other arguments")

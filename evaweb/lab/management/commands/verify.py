@@ -15,10 +15,10 @@ class Command(BackupCommand):
     help = "Compares a backup's database and files with their digests; needs no lab."
 
     def work_on(self, path: Path) -> None:
-        found, problems = backup.verify(path, self.stderr.write)
+        copy, problems = backup.verify(path, self.stderr.write)
         for problem in problems:
             self.stdout.write(problem)
         if problems:
-            raise BackupError(f"{found.path}: {len(problems)} of its files are not as they were written")
-        made, version = found.about["made"], found.about["version"]
-        self.stdout.write(f"{found.path}, made {made} by version {version}: as it was written")
+            raise BackupError(f"{copy.path}: {len(problems)} of its files are not as they were written")
+        created, version = copy.about["made"], copy.about["version"]
+        self.stdout.write(f"{copy.path}, made {created} by version {version}: as it was written")

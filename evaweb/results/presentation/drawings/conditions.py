@@ -42,7 +42,7 @@ def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Draw
     letters = int(column / 8)
     lines = max(len(wrapped(arm.checkpoint, letters, 3)) for arm in arms)
     width, top = _LABELS + column * len(arms), 10 + LINE * lines
-    parts, said = [], []
+    parts, texts = [], []
     for i, arm in enumerate(arms):
         middle = 5 + LINE * (lines + 1) / 2
         parts.append(label(_LABELS + column * (i + 0.5), middle, arm.checkpoint, letters, "middle", 3))
@@ -50,22 +50,22 @@ def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Draw
         y = top + _CELL * row
         parts.append(label(_LABELS - 12, y + 20, condition, _LETTERS, "end"))
         for i, arm in enumerate(arms):
-            found = arm.cells.get(condition)
+            rate = arm.cells.get(condition)
             x = _LABELS + column * i
-            if found is None or found.rate is None:
+            if rate is None or rate.rate is None:
                 parts.append(words(x + column / 2, y + 20, "–", "middle", "tick"))
                 continue
             cell = element(
                 "rect", x=x + 1, y=float(y + 1), width=column - 2, height=float(_CELL - 2), class_="cell",
-                fill_opacity=f"{0.55 * found.rate:.3f}",
+                fill_opacity=f"{0.55 * rate.rate:.3f}",
             )  # fmt: skip
-            cell += words(x + column / 2, y + 20, f"{found.successes}/{found.n}", "middle", "strong")
-            title = f"{arm.checkpoint} at {condition}: {rate_words(found)}"
+            cell += words(x + column / 2, y + 20, f"{rate.successes}/{rate.n}", "middle", "strong")
+            title = f"{arm.checkpoint} at {condition}: {rate_words(rate)}"
             parts.append(link(links.get((arm.checkpoint, condition), ""), title, cell))
-            said.append(title)
+            texts.append(title)
     height = top + _CELL * len(conditions) + 6
     return drawing(
-        width, height, "Successes by initial condition", "; ".join(said), *parts, kind="grid-figure",
+        width, height, "Successes by initial condition", "; ".join(texts), *parts, kind="grid-figure",
         columns=("checkpoint", "condition", *PROPORTION),
         rows=[
             (arm.checkpoint, condition, *counted(arm.cells[condition]))
@@ -85,7 +85,7 @@ def draw_pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
     # Rounded up to 10 %, so that the longest interval fits.
     most = min(1.0, math.ceil(10 * max((mode.interval.high for mode in arm.failures), default=1.0)) / 10)
     scale = Scale(0, most, _LABELS, width - 165)
-    parts, said = [_percents(scale, height - 26)], []
+    parts, texts = [_percents(scale, height - 26)], []
     for at, mode in enumerate(arm.failures):
         y, so_far = float(row * at), so_far + mode.count
         share = f"{mode.count}/{mode.n}, {100 * mode.count / mode.n:.0f} % [{format_interval(mode.interval)}]"
@@ -98,9 +98,9 @@ def draw_pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
         bar += words(width - 155, y + 18, share, class_="value small")
         title = f"{mode.words}: {share}; {so_far} of {total} failures so far"
         parts.append(link(links.get((mode.phase, mode.cause), ""), title, bar))
-        said.append(title)
+        texts.append(title)
     return drawing(
-        width, height, f"Why trials of {arm.checkpoint} failed", "; ".join(said), *parts, kind="pareto",
+        width, height, f"Why trials of {arm.checkpoint} failed", "; ".join(texts), *parts, kind="pareto",
         columns=("checkpoint", "phase", "cause", "failures", "trials", "low", "high"),
         rows=[
             (arm.checkpoint, mode.phase, mode.cause, mode.count, mode.n, mode.interval.low, mode.interval.high)

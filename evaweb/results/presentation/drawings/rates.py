@@ -44,21 +44,21 @@ def draw_intervals(
     height = step * len(rows) + 44
     scale = Scale(0, 1, _NAMES, WIDTH - 170)
     parts = [percent_axis(scale, height - 26, 6)]
-    for i, (name, found, address) in enumerate(rows):
+    for i, (name, rate, address) in enumerate(rows):
         y, at = 26 + step * i, order.get(name, 0)
         row = label(_NAMES - 12, y + 5, name, _LETTERS, "end")
-        if found.rate is not None and found.interval is not None:
-            low, high = scale(found.interval.low), scale(found.interval.high)
+        if rate.rate is not None and rate.interval is not None:
+            low, high = scale(rate.interval.low), scale(rate.interval.high)
             row += element(
                 "rect", x=low, y=float(y - 5), width=high - low, height=10.0, class_=f"band {series(at)}"
             )
-            row += mark(at, scale(found.rate), y)
-        row += words(WIDTH - 158, y + 5, rate_words(found), class_="value")
-        parts.append(link(address, f"{name}: {rate_words(found)}", row))
-    said = "; ".join(f"{name} {rate_words(found)}" for name, found, _ in rows)
+            row += mark(at, scale(rate.rate), y)
+        row += words(WIDTH - 158, y + 5, rate_words(rate), class_="value")
+        parts.append(link(address, f"{name}: {rate_words(rate)}", row))
+    text = "; ".join(f"{name} {rate_words(rate)}" for name, rate, _ in rows)
     return drawing(
-        WIDTH, height, title, said, *parts, kind="intervals",
-        columns=("checkpoint", *PROPORTION), rows=[(name, *counted(found)) for name, found, _ in rows],
+        WIDTH, height, title, text, *parts, kind="intervals",
+        columns=("checkpoint", *PROPORTION), rows=[(name, *counted(rate)) for name, rate, _ in rows],
     )  # fmt: skip
 
 
@@ -97,13 +97,13 @@ def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
             )
             + words(WIDTH - 48, y + 5, letters.get(arm.checkpoint, ""), class_="letters")
         )
-    said = "; ".join(
+    text = "; ".join(
         f"{arm.checkpoint} mean {arm.posterior.mean:.0%}, 95 % from {arm.posterior.interval().low:.0%} to "
         f"{arm.posterior.interval().high:.0%}, letters {letters.get(arm.checkpoint, '')}"
         for arm in arms
     )
     return drawing(
-        WIDTH, height, "Posterior of the success rates", said, *parts, kind="violins",
+        WIDTH, height, "Posterior of the success rates", text, *parts, kind="violins",
         columns=("checkpoint", "successes", "trials", "posterior_mean", "low", "high", "letters"),
         rows=rows,
     )  # fmt: skip
@@ -129,9 +129,9 @@ def draw_difference(found: Comparison) -> Drawing:
     low, high = scale(interval.low), scale(interval.high)
     parts.append(element("rect", x=low, y=42.0, width=high - low, height=12.0, class_=f"band {series(None)}"))
     parts.append(mark(None, scale(found.difference.value), 48))
-    said = f"{found.first} minus {found.second}: {format_points(found.difference)}"
+    text = f"{found.first} minus {found.second}: {format_points(found.difference)}"
     return drawing(
-        WIDTH, height, "Difference of the success rates in points", said, *parts, kind="difference",
+        WIDTH, height, "Difference of the success rates in points", text, *parts, kind="difference",
         columns=("first", "second", "difference", "low", "high"),
         rows=[(found.first, found.second, found.difference.value, interval.low, interval.high)],
     )  # fmt: skip

@@ -60,9 +60,9 @@ def drawing(
         f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(words)}</desc>'
         f"<metadata>{escape(data)}</metadata>{inner}</svg>"
     )
-    found = Drawing(text)
-    found.heading, found.words = title, words
-    return found
+    figure = Drawing(text)
+    figure.heading, figure.words = title, words
+    return figure
 
 
 _PRINTED = {
@@ -219,24 +219,24 @@ def wrapped(text: str, most: int, rows: int = 2) -> list[str]:
 
     Surplus text is cut from the middle, because names of checkpoints begin alike and differ at their ends.
     """
-    found = [""]
+    lines = [""]
     for word in re.findall(r"[^\s\-_/]*[\s\-_/]?", text):
         for piece in (word[i : i + most] for i in range(0, len(word), most)):
-            if len((found[-1] + piece).rstrip()) > most:
-                found.append("")
-            found[-1] += piece
-    if len(found) <= rows:
-        return [row.rstrip() for row in found]
-    kept = most * rows - 1
-    whole = text[: kept // 2] + "…" + text[len(text) - (kept - kept // 2) :]
+            if len((lines[-1] + piece).rstrip()) > most:
+                lines.append("")
+            lines[-1] += piece
+    if len(lines) <= rows:
+        return [row.rstrip() for row in lines]
+    budget = most * rows - 1
+    whole = text[: budget // 2] + "…" + text[len(text) - (budget - budget // 2) :]
     return [whole[i : i + most] for i in range(0, len(whole), most)]
 
 
 def label(x: float, y: float, text: str, most: int, anchor: str = "start", rows: int = 2) -> str:
     """Return a name in as few lines as possible, centred vertically at `y`."""
-    found = wrapped(text, most, rows)
-    top = y - LINE * (len(found) - 1) / 2
-    return "".join(words(x, top + LINE * i, row, anchor) for i, row in enumerate(found))
+    lines = wrapped(text, most, rows)
+    top = y - LINE * (len(lines) - 1) / 2
+    return "".join(words(x, top + LINE * i, row, anchor) for i, row in enumerate(lines))
 
 
 def legend(names: Sequence[tuple[int, str]], width: float) -> tuple[str, float]:

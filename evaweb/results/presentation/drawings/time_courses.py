@@ -76,13 +76,13 @@ def draw_funnel(
             parts.append(link(links.get((name, at), ""), title, row))
             y += bar
         y += gap
-    said = "; ".join(
+    description = "; ".join(
         f"{name}: "
         + ", ".join(f"{t} {rate_words(s.of_all)}" for t, s in zip(rows.labels, rows.steps, strict=True))
         for _, name, rows in found
     )
     return drawing(
-        WIDTH, height, f"Milestones of {scene}, share of all trials", said, *parts, kind="funnel",
+        WIDTH, height, f"Milestones of {scene}, share of all trials", description, *parts, kind="funnel",
         columns=("checkpoint", "order", "milestone", *PROPORTION),
         rows=[
             (name, at, text, *counted(step.of_all))
@@ -106,7 +106,7 @@ def draw_success_times(arms: Sequence[Arm]) -> Drawing | None:
         parts.append(words(42, y(share / 100) + 5, f"{share}", "end", "tick"))
     parts += [words(x(t), bottom + 18, number(t), "middle", "tick") for t in ticks(0, end, 6)]
     parts.append(words(x(end / 2), bottom + 38, "time [s]", "middle", "tick"))
-    said = []
+    texts = []
     labels: list[tuple[float, int, str]] = []
     for i, arm, curve in drawn:
         # Before the first success the band is that of 0 of n.
@@ -124,10 +124,10 @@ def draw_success_times(arms: Sequence[Arm]) -> Drawing | None:
         )
         labels.append((y(curve.successes / curve.n), i, arm.checkpoint))
         median = f"half within {curve.median:.1f} s" if curve.median is not None else "half never"
-        said.append(f"{arm.checkpoint}: {median}, {curve.successes} of {curve.n} within {end:.1f} s")
+        texts.append(f"{arm.checkpoint}: {median}, {curve.successes} of {curve.n} within {end:.1f} s")
     parts += _names(labels, x(end), bottom)
     return drawing(
-        WIDTH, height, "Time to success: percentage of trials that have succeeded", "; ".join(said), *parts,
+        WIDTH, height, "Time to success: percentage of trials that have succeeded", "; ".join(texts), *parts,
         kind="success-times",
         columns=("checkpoint", "time_s", "share", "low", "high"),
         rows=[
@@ -145,14 +145,14 @@ def draw_evidence(
 
     The axis extends to `foreseen` pairs, if given. `drawn` are the series of the first and the second checkpoint.
     """
-    wanted = math.log10(2 / found.alpha)
+    threshold = math.log10(2 / found.alpha)
     paths = [[value / math.log(10) for value in path] for path in (found.first, found.second)]
     end = max(found.pairs, foreseen or 0, 1)
     values = [v for path in paths for v in path]
     x = Scale(0, end, 60, WIDTH - _LEGEND)
     y = Scale(
         min(-2.0, max(-4.0, min(values, default=0.0))),
-        max(wanted + 1, *values, 0) if values else wanted + 1,
+        max(threshold + 1, *values, 0) if values else threshold + 1,
         230,
         14,
     )
@@ -164,8 +164,8 @@ def draw_evidence(
     whole = [pair for pair in ticks(0, end, 6) if pair == int(pair)]
     parts += [words(x(pair), 248, number(pair, 6), "middle", "tick") for pair in whole]
     parts.append(words(x(end / 2), 268, "pairs", "middle", "tick"))
-    parts.append(line([(x(0), y(wanted)), (x(end), y(wanted))], "wanted"))
-    parts.append(words(x(end) + 8, y(wanted) + 5, f"suffices: {2 / found.alpha:g}", class_="tick"))
+    parts.append(line([(x(0), y(threshold)), (x(end), y(threshold))], "wanted"))
+    parts.append(words(x(end) + 8, y(threshold) + 5, f"suffices: {2 / found.alpha:g}", class_="tick"))
     labels = []
     for i, path, name in zip(drawn, paths, (first, second), strict=True):
         parts.append(
@@ -175,10 +175,10 @@ def draw_evidence(
     if found.stop is not None:
         parts.append(line([(x(found.stop), 14), (x(found.stop), 230)], "stop"))
         parts.append(words(x(found.stop) + 5, 24, f"pair {found.stop}", class_="tick"))
-    parts += _names([*labels, (y(wanted), -1, "")], x(end), 262)
-    said = f"Evidence {evidence_text(found)}"
+    parts += _names([*labels, (y(threshold), -1, "")], x(end), 262)
+    description = f"Evidence {evidence_text(found)}"
     return drawing(
-        WIDTH, 276, "Evidence (e-value) after each pair of trials", said, *parts, kind="evidence",
+        WIDTH, 276, "Evidence (e-value) after each pair of trials", description, *parts, kind="evidence",
         columns=("pair", "better", "e_value_log10"),
         rows=[
             (pair, name, value)
@@ -206,12 +206,12 @@ def power(
     parts.append(line([(x(0), y(wanted)), (x(x.high), y(wanted))], "wanted"))
     parts.append(line([(x(planned), 14), (x(planned), bottom)], "stop"))
     parts.append(words(x(planned) + 5, 24, f"planned: {planned}", class_="tick"))
-    labels, said = [], []
+    labels, texts = [], []
     for i, name, points in curves:
-        parts.append(line([(x(n), y(found)) for n, found in points], f"curve {series(i)}"))
+        parts.append(line([(x(n), y(chance)) for n, chance in points], f"curve {series(i)}"))
         labels.append((y(points[-1][1]), i, name))
-        at = [f"{100 * found:.0f} % with {n}" for n, found in points if n == planned or n == points[-1][0]]
-        said.append(f"{name}: {', '.join(at)}")
+        at = [f"{100 * chance:.0f} % with {n}" for n, chance in points if n == planned or n == points[-1][0]]
+        texts.append(f"{name}: {', '.join(at)}")
     if labels:
         parts += _names(labels, x(x.high), bottom)
     title = "Power in percent, by trials of each checkpoint"
@@ -219,11 +219,11 @@ def power(
         WIDTH,
         276,
         title,
-        "; ".join(said) or "not computed yet",
+        "; ".join(texts) or "not computed yet",
         *parts,
         kind="power",
         columns=("design", "trials", "power"),
-        rows=[(name, n, found) for _, name, points in curves for n, found in points],
+        rows=[(name, n, chance) for _, name, points in curves for n, chance in points],
     )
 
 

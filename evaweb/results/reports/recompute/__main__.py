@@ -44,7 +44,7 @@ _TAIL = 0.015  # tolerance of the 2.5 % of new draws beyond an interval's end: s
 def main() -> int:
     """Compare data, page and recomputed numbers; print differences and return the exit code."""
     data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "data"
-    plan, seal, shown, record = (
+    plan, seal, shown_numbers, record = (
         json.loads((data / f"{name}.json").read_text("utf-8"), object_pairs_hook=_once)
         for name in ("plan", "seal", "numbers", "integrity")
     )
@@ -60,27 +60,27 @@ def main() -> int:
     wrong = [
         *hidden,
         *(f"data/{name} is no part of a report" for name in sorted(_names(data) - _FILES)),
-        *page_contradictions(page, seal, plan, shown),
+        *page_contradictions(page, seal, plan, shown_numbers),
         *faults(seal, plan, rows),
         *gaps(rows, scores, record),
         *changes(rows, scores, judged, seal, record),
         *record_contradictions(rows, scores, plan, seal["at_reveal"]),
         *_boundary(plan),
     ]
-    found = {}
+    result = {}
     try:
         trials = [_trial(row) for row in _as_revealed(rows, scores, seal["at_reveal"])]
         wrong += [*scene_faults(plan, rows, scores, ratings), *ending_faults(plan, rows)]
         people = Counter(map(_of, preferred))
-        said = planned(trials, plan, seal["at_reveal"])
+        conclusions = planned(trials, plan, seal["at_reveal"])
         if seal["at_reveal"]:
-            blocks, told = recorded_blocks(seal["at_reveal"]), seal["at_reveal"].get("headline", ())
-            wrong += headline_faults(said, blocks, plan, told)
-        wrong += page_faults(page, shown, trials, _later(scores, seal["at_reveal"]))
-        found = numbers(trials, plan, said)
-        found |= {
-            "letters": planned_letters(trials, plan, seal["at_reveal"]) or found["letters"],
-            "planned": said,
+            blocks, headline = recorded_blocks(seal["at_reveal"]), seal["at_reveal"].get("headline", ())
+            wrong += headline_faults(conclusions, blocks, plan, headline)
+        wrong += page_faults(page, shown_numbers, trials, _later(scores, seal["at_reveal"]))
+        result = numbers(trials, plan, conclusions)
+        result |= {
+            "letters": planned_letters(trials, plan, seal["at_reveal"]) or result["letters"],
+            "planned": conclusions,
             "agreement": _agreement(rows, scores, ratings),
             "judges": _judges(rows, scores, judgements),
             "preferences": preferences(
@@ -92,23 +92,23 @@ def main() -> int:
         }
     except _BROKEN as fault:
         wrong.append(f"the files in data/ contradict each other, no number follows: {fault!r}")
-    seen = 0
-    for where, problem in differences(shown, found, ""):
-        seen += 1
+    count = 0
+    for where, problem in differences(shown_numbers, result, ""):
+        count += 1
         if problem:
             wrong.append(f"{where}: {problem}")
     for line in wrong[:_SHOWN]:
         print(line)
     if len(wrong) > _SHOWN:
         print(f"and {len(wrong) - _SHOWN} others")
-    for line in statement(seal, plan, shown, record):
+    for line in statement(seal, plan, shown_numbers, record):
         print(line)
-    kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
+    sealing = "with its key, schedule and codes" if seal["key"] else "by its digest"
     print(f"frozen under the commitment {seal['commitment']}: hold it against what was published then")
     if seal["at_reveal"]:
         digest = seal["at_reveal"]["digest"]
         print(f"kept at the reveal under the digest {digest}: hold it against what was published then")
-    print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
+    print(f"{count} numbers from {len(rows)} trials, and the plan {sealing}: {len(wrong)} do not come out")
     if wrong:
         return 1
     if not seal["key"]:
@@ -122,9 +122,9 @@ def statement(
     seal: dict[str, Any], plan: dict[str, Any], shown: dict[str, Any], record: dict[str, Any]
 ) -> Iterator[str]:
     """Yield lines that state the result as the data give it, independently of the report's page."""
-    kept = seal["at_reveal"] or {}
+    reveal = seal["at_reveal"] or {}
     yield f"What follows from data/, of {plan['title']} v{plan['version']}, {plan['stopping']['rule']}:"
-    for sentence in (*kept.get("headline", ()), kept.get("setting", "")):
+    for sentence in (*reveal.get("headline", ()), reveal.get("setting", "")):
         yield f"  {sentence}" if sentence else "  (no comparison was decided)"
     for name, arm in shown["arms"].items():
         low, high = (100 * end for end in arm["wilson"])
@@ -140,19 +140,19 @@ def statement(
             "late",
             *_DECLARED,
         )
-        seen = [f"{row[name]} {name.replace('_', ' ')}" for name in counts if row.get(name)]
-        if seen:
-            yield f"  {row['checkpoint']}: {row['attempts']} attempts, {', '.join(seen)}"
-    for sentence in kept.get("caveats", ()):
+        events = [f"{row[name]} {name.replace('_', ' ')}" for name in counts if row.get(name)]
+        if events:
+            yield f"  {row['checkpoint']}: {row['attempts']} attempts, {', '.join(events)}"
+    for sentence in reveal.get("caveats", ()):
         yield f"  doubt: {sentence}"
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object; raise ValueError if a key occurs twice."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError(f"a key stands twice in {sorted(found)[:3]} ...")
-    return found
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        raise ValueError(f"a key stands twice in {sorted(values)[:3]} ...")
+    return values
 
 
 def _names(data: Path) -> set[str]:
@@ -171,11 +171,11 @@ def _boundary(plan: dict[str, Any]) -> list[str]:
     """Return the faults of the boundary of the plan's design; [] without one."""
     if not plan["stopping"].get("boundary"):
         return []
-    found, alpha = error(plan), share_of(plan)
+    probability, alpha = error(plan), share_of(plan)
     print(
-        f"the boundary stops wrongly with probability at most {found:.5f}; alpha of each comparison is {alpha:g}"
+        f"the boundary stops wrongly with probability at most {probability:.5f}; alpha of each comparison is {alpha:g}"
     )
-    return [] if found <= alpha else [f"boundary: {found:.5f} is more than alpha, {alpha:g}"]
+    return [] if probability <= alpha else [f"boundary: {probability:.5f} is more than alpha, {alpha:g}"]
 
 
 def _rows(path: Path) -> Rows:
@@ -217,32 +217,34 @@ def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, s
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
     """Return the agreement of second raters with the scores at the time of their ratings, for trials that count."""
-    given = _scores_by_trial(rows, scores)
-    pairs = [(_stood(given[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in given]
+    scores_of = _scores_by_trial(rows, scores)
+    pairs = [
+        (_stood(scores_of[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in scores_of
+    ]
     if not pairs:
         return None
     milestones: dict[str, list[tuple[bool, bool]]] = {}
-    for one, other in pairs:
-        again = by_text(json.loads(other["milestones"]))
-        for text, reached in by_text(json.loads(one["milestones"])).items():
-            if text in again:
-                milestones.setdefault(text, []).append((reached, again[text]))
+    for score, rating in pairs:
+        reached_again = by_text(json.loads(rating["milestones"]))
+        for text, reached in by_text(json.loads(score["milestones"])).items():
+            if text in reached_again:
+                milestones.setdefault(text, []).append((reached, reached_again[text]))
     return {
         "trials": len({row["trial"] for _, row in pairs}),
         "ratings": len(pairs),
         "blind": sum(row["blind"] == "true" for _, row in pairs),
         "success": agreement([(a["success"] == "true", b["success"] == "true") for a, b in pairs]),
-        "milestones": {text: agreement(found) for text, found in milestones.items()},
+        "milestones": {text: agreement(text_pairs) for text, text_pairs in milestones.items()},
         "score_alpha": score_alpha([(float(a["score"]), float(b["score"])) for a, b in pairs]),
     }
 
 
 def _scores_by_trial(rows: Rows, scores: Rows) -> dict[str, Rows]:
     """Return the scores of each trial that counts."""
-    given: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
+    by_trial: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
     for score in scores:
-        given.get(score["trial"], []).append(score)
-    return given
+        by_trial.get(score["trial"], []).append(score)
+    return by_trial
 
 
 def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] | None:
@@ -250,33 +252,33 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
 
     Only trials that count are included.
     """
-    given = _scores_by_trial(rows, scores)
+    scores_of = _scores_by_trial(rows, scores)
     judges: dict[tuple[str, str], Rows] = {}
     for row in judgements:
-        if row["trial"] in given:
+        if row["trial"] in scores_of:
             judges.setdefault((row["judge"], row["version"]), []).append(row)
-    found = []
-    for (judge, version), said in sorted(judges.items()):
-        words: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
-        for row in said:
+    entries = []
+    for (judge, version), judge_rows in sorted(judges.items()):
+        triples: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
+        for row in judge_rows:
             own = by_text((text, word) for text, *word in json.loads(row["milestones"]))
-            stood = _stood(given[row["trial"]], row["at"])
+            stood = _stood(scores_of[row["trial"]], row["at"])
             for text, scored in by_text(json.loads(stood["milestones"])).items():
                 if text in own:
-                    words.setdefault(text, []).append((scored, *own[text]))
-        reasons = [row["reason"] for row in said if row["reason"]]
-        probable = [(p, scored) for of_one in words.values() for scored, _, p in of_one if p is not None]
-        found.append(
+                    triples.setdefault(text, []).append((scored, *own[text]))
+        reasons = [row["reason"] for row in judge_rows if row["reason"]]
+        probable = [(p, scored) for of_one in triples.values() for scored, _, p in of_one if p is not None]
+        entries.append(
             {
                 "judge": judge,
                 "version": version,
-                "trials": len(said),
+                "trials": len(judge_rows),
                 "no_verdict": {reason: reasons.count(reason) for reason in reasons},
-                "milestones": {text: on_milestone(of_one) for text, of_one in words.items()},
+                "milestones": {text: on_milestone(of_one) for text, of_one in triples.items()},
                 "calibration": calibration(probable),
             }
         )
-    return found or None
+    return entries or None
 
 
 def _stood(scores: Rows, at: str) -> dict[str, str]:
@@ -339,8 +341,8 @@ def differences(shown: Any, found: Any, where: str) -> Iterator[tuple[str, str]]
     elif isinstance(shown, list) and isinstance(found, list):
         if len(shown) != len(found):
             yield where, f"{len(shown)} entries are shown, {len(found)} come out"
-        for i, (one, other) in enumerate(zip(shown, found, strict=False)):
-            yield from differences(one, other, f"{where}[{i}]")
+        for i, (shown_item, found_item) in enumerate(zip(shown, found, strict=False)):
+            yield from differences(shown_item, found_item, f"{where}[{i}]")
     elif _number(shown) and _number(found):
         close = math.isclose(shown, found, rel_tol=_CLOSE, abs_tol=1e-9)
         yield where, "" if close else f"{shown} is shown, {found} comes out"
@@ -352,15 +354,15 @@ def _number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _drawn(shown: Any, drawn: Drawn) -> str:
-    if not (isinstance(shown, list) and len(shown) == 2 and all(map(_number, shown))):
-        return f"{shown!r} is shown; an interval comes out"
-    low, high = shown
+def _drawn(interval: Any, drawn: Drawn) -> str:
+    if not (isinstance(interval, list) and len(interval) == 2 and all(map(_number, interval))):
+        return f"{interval!r} is shown; an interval comes out"
+    low, high = interval
     n, slack = len(drawn.lower), 1e-9
     beyond = (sum(d < low - slack for d in drawn.lower) / n, sum(d > high + slack for d in drawn.upper) / n)
     within = (sum(d <= low + slack for d in drawn.lower) / n, sum(d >= high - slack for d in drawn.upper) / n)
     if max(beyond) > 0.025 + _TAIL or min(within) < 0.025 - _TAIL:
-        return f"{shown} is shown; of {n} drawn anew {beyond[0]:.2%} are below and {beyond[1]:.2%} above"
+        return f"{interval} is shown; of {n} drawn anew {beyond[0]:.2%} are below and {beyond[1]:.2%} above"
     return ""
 
 

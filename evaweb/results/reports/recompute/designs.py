@@ -44,12 +44,12 @@ def planned_letters(
     ended; else None.
     """
     names, arms = comparisons_of(plan), arms_of(plan)
-    said = planned(trials, plan, at_reveal)
+    results = planned(trials, plan, at_reveal)
     if (
         len(names) < 3
         or 2 * len(names) != len(arms) * (len(arms) - 1)
         or plan["stopping"].get("margin") is not None
-        or any(one["at"] is None for one in said)
+        or any(row["at"] is None for row in results)
     ):
         return None
     blocks = recorded_blocks(at_reveal) if at_reveal else blocks_of(trials, plan)
@@ -58,7 +58,7 @@ def planned_letters(
         values = [value for block in blocks for arm, value in block if arm == number]
         rates[name] = sum(values) / len(values) if values else 0.0
     ranked = sorted(arms, key=lambda name: (-rates[name], name))
-    apart = {frozenset((one["first"], one["second"])) for one in said if one["winner"] is not None}
+    apart = {frozenset((row["first"], row["second"])) for row in results if row["winner"] is not None}
     return methods.letters(ranked, apart)
 
 
@@ -77,7 +77,7 @@ def recorded_blocks(at_reveal: Mapping[str, Any]) -> list[Block]:
     """Return the blocks recorded at a reveal; early reveals recorded pairs."""
     if "blocks" in at_reveal:
         return [[(arm, float(value)) for arm, value in block] for block in at_reveal["blocks"]]
-    return [[(0, float(one)), (1, float(other))] for one, other in at_reveal["pairs"]]
+    return [[(0, float(first)), (1, float(second))] for first, second in at_reveal["pairs"]]
 
 
 def blocks_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Block]:
@@ -92,7 +92,7 @@ def blocks_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Block]:
             value = trial.score if by_score else float(trial.success)
             blocks[int(trial.block)][int(trial.slot)] = (arms.index(trial.checkpoint), value)
     whole = [[of for _, of in sorted(blocks.get(at, {}).items())] for at in range(_foreseen(plan))]
-    used = max((said["blocks"] for said in conclusions(whole, plan)), default=0)
+    used = max((row["blocks"] for row in conclusions(whole, plan)), default=0)
     return list(whole[:used])
 
 
@@ -103,34 +103,34 @@ def record_contradictions(
     at_reveal: Mapping[str, Any] | None,
 ) -> list[str]:
     """Return contradictions between trials, scores, and the blocks recorded at the reveal."""
-    given: dict[str, list[Mapping[str, str]]] = defaultdict(list)
+    by_trial: dict[str, list[Mapping[str, str]]] = defaultdict(list)
     for score in scores:
-        given[score["trial"]].append(score)
-    known = {row["trial"] for row in rows}
-    found = [
+        by_trial[score["trial"]].append(score)
+    trials = {row["trial"] for row in rows}
+    sentences = [
         f"scores.csv has a score of trial {trial}, trials.csv no such trial"
-        for trial in given
-        if trial not in known
+        for trial in by_trial
+        if trial not in trials
     ]
     for row in rows:
-        newest = given[row["trial"]][-1] if given[row["trial"]] else {}
-        said, kept = (
+        newest = by_trial[row["trial"]][-1] if by_trial[row["trial"]] else {}
+        own, stored = (
             [_plain(of.get(name, "")) for name in ("success", "score", "milestones")] for of in (row, newest)
         )
-        if said != kept and (newest or row["status"] == "scored"):
-            found.append(f"trial {row['trial']} is said to be {said}, its newest score is {kept}")
-    if at_reveal is not None and not found:
-        stood = [_stood(row, given, at_reveal["at"]) for row in rows]
-        kept, given_then = recorded_blocks(at_reveal), blocks_of(stood, plan)
+        if own != stored and (newest or row["status"] == "scored"):
+            sentences.append(f"trial {row['trial']} is said to be {own}, its newest score is {stored}")
+    if at_reveal is not None and not sentences:
+        stood = [_stood(row, by_trial, at_reveal["at"]) for row in rows]
+        stored, blocks_then = recorded_blocks(at_reveal), blocks_of(stood, plan)
         # Compared without the order within a block: reveals that recorded pairs did not record it.
-        if [sorted(block) for block in kept] != [sorted(block) for block in given_then]:
-            found.append("the blocks of the reveal are not those of the scores that stood then")
-        found += [
+        if [sorted(block) for block in stored] != [sorted(block) for block in blocks_then]:
+            sentences.append("the blocks of the reveal are not those of the scores that stood then")
+        sentences += [
             f"the sums of {arm['checkpoint']} at the reveal are not those of the scores that stood then"
             for arm in at_reveal.get("arms", ())  # recorded only by later formats
             if not _adds_up(arm, [row for row in stood if row.status and row.checkpoint == arm["checkpoint"]])
         ]
-    return found
+    return sentences
 
 
 def _adds_up(arm: Mapping[str, Any], rows: Sequence[_Stood]) -> bool:
@@ -149,10 +149,10 @@ class _Stood:
     score: float
 
 
-def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str]]], at: str) -> _Stood:
+def _stood(row: Mapping[str, str], by_trial: Mapping[str, Sequence[Mapping[str, str]]], at: str) -> _Stood:
     """Return the trial with the last score given at or before `at`; it does not count if there was none."""
     then = datetime.fromisoformat(at)
-    before = [score for score in given[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
+    before = [score for score in by_trial[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
     counts = row["status"] == "scored" and bool(before)
     success, score = (before[-1]["success"] == "true", float(before[-1]["score"])) if counts else (False, 0.0)
     slot = int(row["slot"])
@@ -177,122 +177,128 @@ def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[s
     names, arms = comparisons_of(plan), arms_of(plan)
     sides = [(arms.index(first), arms.index(second)) for first, second in names]
     foreseen = _foreseen(plan)
-    given = blocks[:foreseen]
-    found: dict[int, dict[str, Any]] = {}
+    used = blocks[:foreseen]
+    by_number: dict[int, dict[str, Any]] = {}
     if not plan["stopping"].get("drops"):
-        found = {n: _conclusion(given, plan, pair) for n, pair in enumerate(sides)}
-        if plan.get("format", 1) >= 6 and all(said["p"] is not None for said in found.values()):
-            _step_by_step(found, given, plan, sides)
+        by_number = {n: _conclusion(used, plan, pair) for n, pair in enumerate(sides)}
+        if plan.get("format", 1) >= 6 and all(row["p"] is not None for row in by_number.values()):
+            _step_by_step(by_number, used, plan, sides)
     dropped: dict[int, int] = {}
     # With a margin no arm is found worse; a control, which is in all comparisons, always stays.
     margin = plan["stopping"].get("margin") is not None
     spared = {arm for arm in range(len(arms)) if margin or all(arm in pair for pair in sides)}
-    while len(found) < len(sides):
-        made = list(given)
-        for number, block in enumerate(given):
-            wanted = {arm for arm in range(len(arms)) if dropped.get(arm, foreseen) > number}
-            if not wanted <= {arm for arm, _ in block}:
-                made = list(given[:number])
+    while len(by_number) < len(sides):
+        complete = list(used)
+        for number, block in enumerate(used):
+            needed = {arm for arm in range(len(arms)) if dropped.get(arm, foreseen) > number}
+            if not needed <= {arm for arm, _ in block}:
+                complete = list(used[:number])
                 break
-        left = {n: _conclusion(made, plan, pair) for n, pair in enumerate(sides) if n not in found}
-        ends = [said["at"] for said in left.values() if said["winner"] is not None]
+        left = {n: _conclusion(complete, plan, pair) for n, pair in enumerate(sides) if n not in by_number}
+        ends = [row["at"] for row in left.values() if row["winner"] is not None]
         if not ends:
-            found |= left
+            by_number |= left
             break
         at = min(ends)
-        for n, said in left.items():
-            if said["winner"] is not None and said["at"] == at:
-                found[n] = {**said, "blocks": at}
+        for n, row in left.items():
+            if row["winner"] is not None and row["at"] == at:
+                by_number[n] = {**row, "blocks": at}
         worse = {
-            sides[n][1 - said["winner"]] for n, said in found.items() if n in left and said["at"] == at
+            sides[n][1 - row["winner"]] for n, row in by_number.items() if n in left and row["at"] == at
         } - spared
         for n in left:
-            if n not in found and worse & {*sides[n]}:
-                found[n] = {"blocks": at, "at": at, "winner": None, "p": None, "estimate": None}
-        still = {arm for n, pair in enumerate(sides) if n not in found for arm in pair}
+            if n not in by_number and worse & {*sides[n]}:
+                by_number[n] = {"blocks": at, "at": at, "winner": None, "p": None, "estimate": None}
+        still = {arm for n, pair in enumerate(sides) if n not in by_number for arm in pair}
         dropped |= {arm: at for arm in range(len(arms)) if arm not in still and arm not in dropped}
     return [
         {
             "first": first,
             "second": second,
-            **found[n],
-            "winner": None if found[n]["winner"] is None else (first, second)[found[n]["winner"]],
+            **by_number[n],
+            "winner": None if by_number[n]["winner"] is None else (first, second)[by_number[n]["winner"]],
         }
         for n, (first, second) in enumerate(names)
     ]
 
 
 def _step_by_step(
-    found: dict[int, dict[str, Any]],
-    given: Sequence[Block],
+    by_number: dict[int, dict[str, Any]],
+    blocks: Sequence[Block],
     plan: Mapping[str, Any],
     sides: Sequence[tuple[int, int]],
 ) -> None:
     """Apply Holm's procedure: smallest p at alpha over all comparisons, the next at alpha over the remaining
     ones, and so on.
     """
-    ranked = sorted(found, key=lambda n: found[n]["p"])
+    ranked = sorted(by_number, key=lambda n: by_number[n]["p"])
     for left, n in zip(range(len(ranked), 0, -1), ranked, strict=True):
-        if found[n]["p"] > plan["stopping"]["alpha"] / left * (1 + _TIE):
+        if by_number[n]["p"] > plan["stopping"]["alpha"] / left * (1 + _TIE):
             break
-        first, second = (_side_mean(given, plan, side) for side in sides[n])
-        found[n]["winner"] = int(first <= second)
+        first, second = (_side_mean(blocks, plan, side) for side in sides[n])
+        by_number[n]["winner"] = int(first <= second)
 
 
-def _side_mean(given: Sequence[Block], plan: Mapping[str, Any], arm: int) -> float:
-    values = [value for block in given for number, value in block if number == arm]
+def _side_mean(blocks: Sequence[Block], plan: Mapping[str, Any], arm: int) -> float:
+    values = [value for block in blocks for number, value in block if number == arm]
     return math.fsum(values) / len(values)
 
 
 def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[int, int]) -> dict[str, Any]:
     """Return the conclusion of one comparison; `winner` is 0 or 1."""
-    said = plan["stopping"]
-    foreseen, alpha, margin = _foreseen(plan), share_of(plan), said.get("margin")
-    given = _complete_blocks(blocks, said.get("counts"), sides)
-    at, winner, p = len(given) if len(given) == foreseen else None, None, None
-    found = None
-    if said.get("boundary"):
-        looks = {(look[0], look[1]): look for look in said["boundary"]}
-        for number in range(1, len(given) + 1):
-            (first, n), (second, m) = (_sum(given[:number], side) for side in (0, 1))
-            look = looks.get((n, m) if margin is None else (m, n))
-            side = None if look is None else _side(look, first, second, margin)
+    stopping = plan["stopping"]
+    foreseen, alpha, margin = _foreseen(plan), share_of(plan), stopping.get("margin")
+    complete = _complete_blocks(blocks, stopping.get("counts"), sides)
+    at, winner, p = len(complete) if len(complete) == foreseen else None, None, None
+    difference = None
+    if stopping.get("boundary"):
+        tables = {(table[0], table[1]): table for table in stopping["boundary"]}
+        for number in range(1, len(complete) + 1):
+            (first, n), (second, m) = (_sum(complete[:number], side) for side in (0, 1))
+            table = tables.get((n, m) if margin is None else (m, n))
+            side = None if table is None else _side(table, first, second, margin)
             if side is not None:
                 at, winner = number, side
                 break
         if at is not None and margin is None:
-            (first, n), (second, m) = (_sum(given[:at], side) for side in (0, 1))
-            found = estimate(said["boundary"], int(first), n, int(second), m)
-    elif said["rule"] == "evidence":
-        at, winner = _evidence([(one[0], other[0]) for one, other in given], said, alpha, at)
+            (first, n), (second, m) = (_sum(complete[:at], side) for side in (0, 1))
+            difference = estimate(stopping["boundary"], int(first), n, int(second), m)
+    elif stopping["rule"] == "evidence":
+        at, winner = _evidence([(x[0], y[0]) for x, y in complete], stopping, alpha, at)
     elif at is not None:
-        (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
-        if said.get("outcome") == "score":
-            p = methods.sign_flips([one[0] - other[0] for one, other in given])
+        (first, n), (second, m) = (_sum(complete, side) for side in (0, 1))
+        if stopping.get("outcome") == "score":
+            p = methods.sign_flips([x[0] - y[0] for x, y in complete])
         else:
             p = methods.barnard(int(first), n, int(second), m)[1] if n and m else 1.0
         winner = int(first * m <= second * n) if p <= alpha * (1 + _TIE) else None
-    return {"blocks": len(given), "at": at, "winner": winner, "p": p, "estimate": found and list(found)}
+    return {
+        "blocks": len(complete),
+        "at": at,
+        "winner": winner,
+        "p": p,
+        "estimate": difference and list(difference),
+    }
 
 
 def _complete_blocks(
     blocks: Sequence[Block], counts: Sequence[Sequence[int]] | None, sides: tuple[int, int]
 ) -> list[tuple[list[float], list[float]]]:
     """Return the outcomes of both sides by block, up to the first incomplete block."""
-    made: list[tuple[list[float], list[float]]] = []
+    complete: list[tuple[list[float], list[float]]] = []
     before = [0, 0]
     for number, block in enumerate(blocks):
-        one, other = ([value for arm, value in block if arm == side] for side in sides)
+        left, right = ([value for arm, value in block if arm == side] for side in sides)
         after = list(counts[number]) if counts else [number + 1, number + 1]
-        if [before[0] + len(one), before[1] + len(other)] != after:
+        if [before[0] + len(left), before[1] + len(right)] != after:
             break
         before = after
-        made.append((one, other))
-    return made
+        complete.append((left, right))
+    return complete
 
 
-def _sum(given: Sequence[tuple[list[float], list[float]]], side: int) -> tuple[float, int]:
-    values = [value for block in given for value in block[side]]
+def _sum(blocks: Sequence[tuple[list[float], list[float]]], side: int) -> tuple[float, int]:
+    values = [value for block in blocks for value in block[side]]
     return sum(values), len(values)
 
 
@@ -302,18 +308,18 @@ def error(plan: Mapping[str, Any]) -> float:
 
     All orders of outcomes that lead to a table are equally likely, and their number is counted exactly.
     """
-    said = plan["stopping"]
-    margin, alpha = said.get("margin"), share_of(plan)
+    stopping = plan["stopping"]
+    margin, alpha = stopping.get("margin"), share_of(plan)
     if margin is not None:
-        return _with_margin(list(_stopped(said["boundary"], margin)), margin)
+        return _with_margin(list(_stopped(stopping["boundary"], margin)), margin)
     gone, trials = [0], 0  # number of stopped orders by total successes
-    for n, m, tables in _stopped(said["boundary"], margin):
+    for n, m, tables in _stopped(stopping["boundary"], margin):
         for _ in range(n + m - trials):
-            gone = [one + other for one, other in zip([*gone, 0], [0, *gone], strict=True)]
+            gone = [left + right for left, right in zip([*gone, 0], [0, *gone], strict=True)]
         trials = n + m
-        for (a, b), ways in tables.items():
-            gone[a + b] += ways
-    share = [ways / math.comb(trials, x) for x, ways in enumerate(gone)]
+        for (a, b), number in tables.items():
+            gone[a + b] += number
+    share = [number / math.comb(trials, x) for x, number in enumerate(gone)]
     return _bound(share, alpha)
 
 
@@ -353,12 +359,12 @@ def _foreseen(plan: Mapping[str, Any]) -> int:
     return int(sum(len(scene["positions"]) for scene in plan["scenes"]) * plan["repetitions"])
 
 
-def _side(look: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
+def _side(table: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
     """Return the side (0 or 1) for which the boundary stops at this `look`; None if it does not stop.
 
     `first` and `second` are the successes of both sides.
     """
-    n, m, *least = look
+    n, m, *least = table
     if margin is not None:  # with a margin it tests its second arm: the first checkpoint
         first, second = second, first
     if not least or not _reaches((int(first), n, int(second), m), (least[0], n, least[1], m), margin):
@@ -369,8 +375,8 @@ def _side(look: Sequence[int], first: float, second: float, margin: float | None
 def _reaches(
     table: tuple[int, int, int, int], least: tuple[int, int, int, int], margin: float | None
 ) -> bool:
-    one, other = _degree(*table, margin), _degree(*least, margin)
-    return one[0] * other[1] >= other[0] * one[1]
+    own, limit = _degree(*table, margin), _degree(*least, margin)
+    return own[0] * limit[1] >= limit[0] * own[1]
 
 
 def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, int]:
@@ -379,8 +385,8 @@ def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, 
     It is the squared pooled statistic; with a margin the signed square of Agresti and Caffo's statistic.
     """
     if margin is None:
-        x, rest = a + b, n + m - a - b
-        return ((a * m - b * n) ** 2, x * rest) if x and rest else (0, 1)
+        x, failures = a + b, n + m - a - b
+        return ((a * m - b * n) ** 2, x * failures) if x and failures else (0, 1)
     a, b, n, m, scale = a + 1, b + 1, n + 2, m + 2, 10**9
     lead = (b * n - a * m) * scale + round(margin * scale) * n * m
     return lead * abs(lead) * n * m, (a * (n - a) * m**3 + b * (m - b) * n**3) * scale**2
@@ -399,14 +405,14 @@ def _walked(
 ) -> Iterator[tuple[int, int, Tables, Tables]]:
     """Yield the trials of each look, the tables that stop there, and those that continue."""
     alive, n, m = {(0, 0): 1}, 0, 0
-    for look in boundary:
-        for arm in (0,) * (look[0] - n) + (1,) * (look[1] - m):
+    for limit in boundary:
+        for arm in (0,) * (limit[0] - n) + (1,) * (limit[1] - m):
             grown: dict[tuple[int, int], int] = defaultdict(int)
-            for (a, b), ways in alive.items():
-                grown[a, b] += ways
-                grown[(a + 1, b) if arm == 0 else (a, b + 1)] += ways
+            for (a, b), number in alive.items():
+                grown[a, b] += number
+                grown[(a + 1, b) if arm == 0 else (a, b + 1)] += number
             alive = grown
-        n, m, *least = look
+        n, m, *least = limit
         gone = [
             (a, b) for a, b in alive if least and _reaches((a, n, b, m), (least[0], n, least[1], m), margin)
         ]
@@ -441,7 +447,9 @@ def _mixed(share: Sequence[float], p: float) -> float:
 
 def _with_margin(stopped: Sequence[tuple[int, int, dict[tuple[int, int], int]]], margin: float) -> float:
     cells = [
-        (math.log(ways), a, n - a, b, m - b) for n, m, tables in stopped for (a, b), ways in tables.items()
+        (math.log(log_number), a, n - a, b, m - b)
+        for n, m, tables in stopped
+        for (a, b), log_number in tables.items()
     ]
     highest = 0.0
     for i in range(1, 401):
@@ -451,26 +459,26 @@ def _with_margin(stopped: Sequence[tuple[int, int, dict[tuple[int, int], int]]],
         highest = max(
             highest,
             math.fsum(
-                math.exp(ways + a * won + not_a * lost + b * other_won + not_b * other_lost)
-                for ways, a, not_a, b, not_b in cells
+                math.exp(log_number + a * won + not_a * lost + b * other_won + not_b * other_lost)
+                for log_number, a, not_a, b, not_b in cells
             ),
         )
     return highest
 
 
 def _evidence(
-    pairs: Sequence[Pair], said: Mapping[str, Any], alpha: float, full: int | None
+    pairs: Sequence[Pair], stopping: Mapping[str, Any], alpha: float, full: int | None
 ) -> tuple[int | None, int | None]:
-    if said.get("outcome") == "score":
+    if stopping.get("outcome") == "score":
         paths = [methods.score_bets([sign * (a - b) for a, b in pairs]) for sign in (1, -1)]
     else:
         paths = [
             methods.success_bets([(bool(pair[1 - side]), bool(pair[side])) for pair in pairs])
             for side in (0, 1)
         ]
-    wanted = math.log(2 / alpha)
+    threshold = math.log(2 / alpha)
     for number, worth in enumerate(zip(*paths, strict=True), start=1):
-        if max(worth) >= wanted:
+        if max(worth) >= threshold:
             return number, worth.index(max(worth))
     return full, None
 
@@ -484,10 +492,10 @@ def estimate(
     """
     beyond: list[tuple[float, ...]] = []
     same: list[tuple[float, ...]] = []
-    looks = [(look[0], look[1]) for look in boundary]
-    if (n, m) not in looks:
+    sizes = [(table[0], table[1]) for table in boundary]
+    if (n, m) not in sizes:
         return None
-    side = _side(boundary[looks.index((n, m))], first, second, None)
+    side = _side(boundary[sizes.index((n, m))], first, second, None)
     mirrored = side == 1
     observed = first * m - second * n
     for at_n, at_m, stopped, left in _walked(boundary, None):
@@ -495,9 +503,9 @@ def estimate(
         for tables, stops in ((stopped, True), (left, False)):
             if not stops and not last:
                 continue
-            for (a, b), ways in tables.items():
+            for (a, b), number in tables.items():
                 lead = a * at_m - b * at_n
-                row = (a, at_n - a, b, at_m - b, math.log(ways))
+                row = (a, at_n - a, b, at_m - b, math.log(number))
                 for_it = lead < 0 if mirrored else lead > 0
                 farther = lead < observed if mirrored else lead > observed
                 if last and (side is None) != stops and lead == observed and (side is None or for_it):
@@ -520,15 +528,15 @@ def estimate(
         )
         return (1 - outside - alike if mirrored else outside), alike
 
-    found = []
-    for wanted, share in ((0.5, 0.5), (0.025, 1.0), (0.975, 0.0)):
+    values = []
+    for target, share in ((0.5, 0.5), (0.025, 1.0), (0.975, 0.0)):
         low, high = -1.0 + _EDGE, 1.0 - _EDGE
         for _ in range(_HALVED):
             middle = (low + high) / 2
             more, alike = chances(middle)
-            low, high = (middle, high) if more + share * alike < wanted else (low, middle)
-        found.append((low + high) / 2)
-    return found[0], found[1], found[2]
+            low, high = (middle, high) if more + share * alike < target else (low, middle)
+        values.append((low + high) / 2)
+    return values[0], values[1], values[2]
 
 
 def _likeliest(difference: float, first: int, n: int, second: int, m: int) -> tuple[float, float]:

@@ -15,7 +15,7 @@ _FAR = 30.0  # size of log-worths that indicates a likelihood without maximum
 
 def agreement(pairs: Sequence[tuple[bool, bool]]) -> dict[str, Any]:
     """Return the agreement of two raters on yes/no pairs."""
-    n, same = len(pairs), sum(one == other for one, other in pairs)
+    n, same = len(pairs), sum(first == second for first, second in pairs)
     observed = same / n
     yes = [sum(pair[i] for pair in pairs) / n for i in (0, 1)]
     by_chance = yes[0] * yes[1] + (1 - yes[0]) * (1 - yes[1])
@@ -43,11 +43,11 @@ def calibration(pairs: Sequence[tuple[float, bool]]) -> dict[str, Any] | None:
     for pair in pairs:
         tenths.setdefault(sum(pair[0] >= k / 10 for k in range(1, 10)), []).append(pair)
     n, bins, gaps = len(pairs), [], 0.0
-    for k, held in sorted(tenths.items()):
-        mean, true = sum(p for p, _ in held) / len(held), sum(so for _, so in held)
-        gaps += len(held) / n * abs(mean - true / len(held))
+    for k, members in sorted(tenths.items()):
+        mean, true = sum(p for p, _ in members) / len(members), sum(so for _, so in members)
+        gaps += len(members) / n * abs(mean - true / len(members))
         edges = {"low": k / 10, "high": (k + 1) / 10}
-        bins.append({**edges, "n": len(held), "probability": mean, "true": true})
+        bins.append({**edges, "n": len(members), "probability": mean, "true": true})
     brier = math.fsum((1 - p) ** 2 if so else p * p for p, so in pairs) / n
     return {"n": n, "brier": brier, "error": gaps, "bins": bins}
 
@@ -58,11 +58,11 @@ def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict
     `said` has for each trial the score, the judge's verdict and its probability; both are None if it gave no verdict.
     """
     pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
-    found = calibration([(p, scored) for scored, _, p in said if p is not None])
+    calibrated = calibration([(p, scored) for scored, _, p in said if p is not None])
     return {
         "no_verdict": len(said) - len(pairs),
         "agreement": agreement(pairs) if pairs else None,
-        "brier": found and found["brier"],
+        "brier": calibrated and calibrated["brier"],
     }
 
 
@@ -77,14 +77,14 @@ def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
 
 def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return a dict from each milestone's text to its value; a repeated text is numbered in order: "held (2)"."""
-    found: dict[str, Any] = {}
-    for text, said in milestones:
+    by_label: dict[str, Any] = {}
+    for text, value in milestones:
         label, n = text, 1
-        while label in found:
+        while label in by_label:
             n += 1
             label = f"{text} ({n})"
-        found[label] = said
-    return found
+        by_label[label] = value
+    return by_label
 
 
 def preferences(rows: Sequence[tuple[str, str, str, float]]) -> dict[str, Any] | None:
@@ -93,10 +93,10 @@ def preferences(rows: Sequence[tuple[str, str, str, float]]) -> dict[str, Any] |
     if not rows:
         return None
     counted = {"n": len(rows), "ties": sum(row[2] == "tie" for row in rows)}
-    found = _fitted(rows, True) or _fitted(rows, False)
-    if found is None:
+    fitted = _fitted(rows, True) or _fitted(rows, False)
+    if fitted is None:
         return {**counted, "ranking": None, "contrasts": [], "tie": None, "order": None, "order_z": None}
-    return {**counted, **found}
+    return {**counted, **fitted}
 
 
 def _fitted(rows: Sequence[tuple[str, str, str, float]], order: bool) -> dict[str, Any] | None:
@@ -106,7 +106,7 @@ def _fitted(rows: Sequence[tuple[str, str, str, float]], order: bool) -> dict[st
     cells: dict[tuple[str, str, str], float] = defaultdict(float)
     for first, second, outcome, weight in rows:
         cells[first, second, outcome] += weight
-    shown = sorted({row[:2] for row in rows})
+    compared = sorted({row[:2] for row in rows})
     kinds = ("first", "second", "tie") if ties else ("first", "second")
 
     def vector(first: str, second: str, kind: str) -> list[float]:
@@ -123,7 +123,7 @@ def _fitted(rows: Sequence[tuple[str, str, str, float]], order: bool) -> dict[st
 
     design = [
         [(vector(*pair, kind), cells[*pair, kind], math.log(2) if kind == "tie" else 0.0) for kind in kinds]
-        for pair in shown
+        for pair in compared
     ]
     x = [0.0] * size
     for _ in range(200):
@@ -197,12 +197,12 @@ def _said(
     worth = {name: t - middle for name, t in zip(names, theta, strict=True)}
     error = {name: math.sqrt(spread[i][i] - 2 * means[i] + whole) for i, name in enumerate(names)}
     contrasts = []
-    for (i, one), (j, other) in combinations(enumerate(names), 2):
+    for (i, first), (j, second) in combinations(enumerate(names), 2):
         gap, half = theta[i] - theta[j], methods.Z * math.sqrt(spread[i][i] + spread[j][j] - 2 * spread[i][j])
         contrasts.append(
             {
-                "first": one,
-                "second": other,
+                "first": first,
+                "second": second,
                 "difference": gap,
                 "win_probability": _logistic(gap),
                 "interval": [_logistic(gap - half), _logistic(gap + half)],

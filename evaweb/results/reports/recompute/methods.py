@@ -137,12 +137,12 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
 
     def tail(angle: float) -> float:
         p = math.sin(angle) ** 2
-        one, two = mass(n1, p), mass(n2, p)
+        first_masses, second_masses = mass(n1, p), mass(n2, p)
         below, above = [0.0], [0.0]
         for k in range(n2 + 1):
-            below.append(below[-1] + two[k])
-            above.append(above[-1] + two[n2 - k])
-        return math.fsum(m * (below[f] + above[e]) for m, (f, e) in zip(one, ends, strict=True))
+            below.append(below[-1] + second_masses[k])
+            above.append(above[-1] + second_masses[n2 - k])
+        return math.fsum(m * (below[f] + above[e]) for m, (f, e) in zip(first_masses, ends, strict=True))
 
     return z, min(1.0, _highest(tail, 0.0, math.pi / 2, 300))
 
@@ -160,9 +160,9 @@ def _highest(function: Callable[[float], float], low: float, high: float, parts:
         left, right = low + (peak - 1) * width, low + (peak + 1) * width
         for _ in range(40):
             third = (right - left) / 3
-            one, two = function(left + third), function(right - third)
-            best = max(best, one, two)
-            left, right = (left + third, right) if one < two else (left, right - third)
+            at_left, at_right = function(left + third), function(right - third)
+            best = max(best, at_left, at_right)
+            left, right = (left + third, right) if at_left < at_right else (left, right - third)
     return best
 
 
@@ -193,12 +193,12 @@ def mcnemar(first_only: int, second_only: int) -> float:
 
 def holm(probabilities: Sequence[float]) -> list[float]:
     """Return the probabilities corrected by Holm's procedure, in the given order."""
-    n, found = len(probabilities), list(probabilities)
+    n, corrected = len(probabilities), list(probabilities)
     for i, p in enumerate(probabilities):
         smaller = [q for j, q in enumerate(probabilities) if (q, j) <= (p, i)]
         ordered = sorted(smaller)
-        found[i] = max(min(1.0, (n - rank) * q) for rank, q in enumerate(ordered))
-    return found
+        corrected[i] = max(min(1.0, (n - rank) * q) for rank, q in enumerate(ordered))
+    return corrected
 
 
 def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
@@ -210,10 +210,10 @@ def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
             group | {name}
             for group in groups
             for name in names
-            if name not in group and not any(frozenset((name, other)) in apart for other in group)
+            if name not in group and not any(frozenset((name, member)) in apart for member in group)
         }
-        kept = {group for group in groups if not any(group < other for other in larger)} | larger
-        grown, groups = kept != groups, kept
+        maximal = {group for group in groups if not any(group < member for member in larger)} | larger
+        grown, groups = maximal != groups, maximal
     place = {name: i for i, name in enumerate(names)}
     columns = sorted(groups, key=lambda group: sorted(place[name] for name in group))
     signs = [chr(97 + i % 26) + (str(i // 26) if i >= 26 else "") for i in range(len(columns))]
@@ -237,8 +237,8 @@ def exact_within(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
             math.fsum(masses[i - j] * own[j] for j in range(len(own)) if 0 <= i - j < len(masses))
             for i in range(len(masses) + len(own) - 1)
         ]
-    seen = masses[sum(table[0] for table in telling) - lowest]
-    return min(1.0, math.fsum(mass for mass in masses if mass <= seen * (1 + 1e-9)))
+    observed = masses[sum(table[0] for table in telling) - lowest]
+    return min(1.0, math.fsum(mass for mass in masses if mass <= observed * (1 + 1e-9)))
 
 
 def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
@@ -252,17 +252,19 @@ def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
     own = [_hypergeometric(n1, n2, x1 + x2) for x1, n1, x2, n2 in telling]
     least, last = _hypergeometric(wide[1], wide[3], wide[0] + wide[2])
     total = wide[0] + sum(table[0] for table in telling)
-    seen = last[wide[0] - least] * math.prod(
+    observed = last[wide[0] - least] * math.prod(
         masses[table[0] - low] for table, (low, masses) in zip(telling, own, strict=True)
     )
-    found = []
+    tables_masses = []
     for chosen in product(*(range(len(masses)) for _, masses in own)):
-        rest = total - sum(low + at for (low, _), at in zip(own, chosen, strict=True)) - least
-        if 0 <= rest < len(last):
-            found.append(
-                last[rest] * math.prod(masses[at] for (_, masses), at in zip(own, chosen, strict=True))
+        last_index = total - sum(low + at for (low, _), at in zip(own, chosen, strict=True)) - least
+        if 0 <= last_index < len(last):
+            tables_masses.append(
+                last[last_index] * math.prod(masses[at] for (_, masses), at in zip(own, chosen, strict=True))
             )
-    return math.fsum(mass for mass in found if mass <= seen * (1 + 1e-9)) / math.fsum(found)
+    return math.fsum(mass for mass in tables_masses if mass <= observed * (1 + 1e-9)) / math.fsum(
+        tables_masses
+    )
 
 
 def _hypergeometric(n1: int, n2: int, successes: int) -> tuple[int, list[float]]:
@@ -332,9 +334,9 @@ def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
     The bets are those of `score_bets` on differences rescaled such that -1 is at -1 and the tested mean at 0.
     """
 
-    def refuted(given: Sequence[float]) -> float:
+    def refuted(values: Sequence[float]) -> float:
         def stands(mean: float) -> float:
-            return -max(score_bets([(1 + d) / (1 + mean) - 1 for d in given]), default=0.0)
+            return -max(score_bets([(1 + d) / (1 + mean) - 1 for d in values]), default=0.0)
 
         least = -1 + 1e-12
         return solve(stands, math.log(alpha / 2), least, 1.0) if stands(least) < math.log(alpha / 2) else -1.0
@@ -358,10 +360,10 @@ def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
     observed, total, bits = abs(sum(units)), sum(map(abs, units)), len(units) + 2
     if not observed:
         return 1.0
-    ways = 1
+    packed = 1
     for unit in units:
-        ways += ways << (bits * abs(unit))
-    below = ways & ((1 << bits * ((total - observed) // 2 + 1)) - 1)
+        packed += packed << (bits * abs(unit))
+    below = packed & ((1 << bits * ((total - observed) // 2 + 1)) - 1)
     return 2 * (below % ((1 << bits) - 1)) / 2 ** len(units)
 
 

@@ -93,16 +93,16 @@ def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str,
     limits = {s["name"]: s["time_limit_s"] for s in plan["scenes"] if s["time_limit_s"] is not None}
     longest = max((t.duration or 0.0 for arm in arms.values() for t in arm), default=0.0)
     timing = Timing(min(limits.values()) if limits else longest, limits)
-    wanted = comparisons_of(plan)
+    planned = comparisons_of(plan)
     couples = [
-        next((pair for pair in wanted if set(pair) == set(couple)), couple)
+        next((pair for pair in planned if set(pair) == set(couple)), couple)
         for couple in combinations(names, 2)
     ]
     in_pairs = plan.get("allocation", "paired") == "paired"
     compared = [
         _comparison(
             *(a, b, arms[a], arms[b]),
-            alpha / (len(wanted) if (a, b) in wanted else len(couples)),
+            alpha / (len(planned) if (a, b) in planned else len(couples)),
             timing,
             in_pairs,
         )
@@ -111,20 +111,24 @@ def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str,
     for comparison, p in zip(compared, methods.holm([c["barnard"]["p"] for c in compared]), strict=True):
         comparison["barnard"]["holm"] = p
     corrected = {frozenset((c["first"], c["second"])): c["barnard"]["holm"] for c in compared}
-    decided = {(one["first"], one["second"]): one for one in said}
+    decided = {(conclusion["first"], conclusion["second"]): conclusion for conclusion in said}
     for comparison in compared:
-        one = decided.get((comparison["first"], comparison["second"]))
-        comparison["standing"] = "not planned" if one is None else "open" if one["at"] is None else "decided"
-        if one is not None:  # its design decides, and not a test
-            corrected[frozenset((one["first"], one["second"]))] = 0.0 if one["winner"] is not None else 1.0
+        conclusion = decided.get((comparison["first"], comparison["second"]))
+        comparison["standing"] = (
+            "not planned" if conclusion is None else "open" if conclusion["at"] is None else "decided"
+        )
+        if conclusion is not None:  # its design decides, and not a test
+            corrected[frozenset((conclusion["first"], conclusion["second"]))] = (
+                0.0 if conclusion["winner"] is not None else 1.0
+            )
         if comparison["standing"] == "open":
             _describe(comparison, plan["stopping"])
-    told = plan["stopping"].get("margin") is None or not decided
-    told = told and all(c["standing"] != "open" for c in compared)
+    has_letters = plan["stopping"].get("margin") is None or not decided
+    has_letters = has_letters and all(c["standing"] != "open" for c in compared)
     return {
         "n": sum(len(arm) for arm in arms.values()),
         "alpha": alpha,
-        "letters": methods.letters(names, methods.separated(names, corrected, alpha)) if told else {},
+        "letters": methods.letters(names, methods.separated(names, corrected, alpha)) if has_letters else {},
         "arms": {name: _arm(arms[name], broken[name], timing) for name in names},
         "comparisons": compared,
         "recipes": _recipes(arms, plan),
@@ -142,13 +146,13 @@ def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, A
         )  # the same weights served in another way
         if row.get("recipe") and row["name"] in arms and not served:
             runs[row["recipe"]][row["name"]] = _rate(arms[row["name"]])
-    found = {}
+    by_recipe = {}
     for recipe, rates in runs.items():
-        said = student(list(rates.values())) if len(rates) > 1 else None
-        if said is not None:
-            ends = said["student"] if len(rates) > 2 else None
-            found[recipe] = {"rates": rates, "runs": said["n"], "mean": said["mean"], "student": ends}
-    return found
+        pooled = student(list(rates.values())) if len(rates) > 1 else None
+        if pooled is not None:
+            ends = pooled["student"] if len(rates) > 2 else None
+            by_recipe[recipe] = {"rates": rates, "runs": pooled["n"], "mean": pooled["mean"], "student": ends}
+    return by_recipe
 
 
 def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:
@@ -182,10 +186,10 @@ def _proportion(x: int, n: int) -> dict[str, Any]:
 
 
 def _by(trials: Trials, key: Callable[[Trial], str]) -> dict[str, list[Trial]]:
-    found: dict[str, list[Trial]] = defaultdict(list)
+    groups: dict[str, list[Trial]] = defaultdict(list)
     for trial in trials:
-        found[key(trial)].append(trial)
-    return dict(sorted(found.items()))
+        groups[key(trial)].append(trial)
+    return dict(sorted(groups.items()))
 
 
 def _arm(trials: Trials, broken: Trials, timing: Timing) -> dict[str, Any]:
@@ -280,7 +284,7 @@ def _drawn(strata: Sequence[Sequence[float]], low: float, high: float) -> Drawn:
     The weights are gaps between uniform numbers; one extra gap is given to 0 for the lower end, to 1 for the upper
     end.
     """
-    chance, found = random.Random(1), Drawn([], [])
+    chance, drawn = random.Random(1), Drawn([], [])
     counted = [list(Counter(values).items()) for values in strata]
     for _ in range(DRAWS):
         lower = upper = 0.0
@@ -290,9 +294,9 @@ def _drawn(strata: Sequence[Sequence[float]], low: float, high: float) -> Drawn:
             total = math.fsum(weights) + more
             share = sum(weight * level for weight, (level, _) in zip(weights, levels, strict=True)) / total
             lower, upper = lower + share, upper + share + more / total
-        found.lower.append(low + (high - low) * lower / len(strata))
-        found.upper.append(low + (high - low) * upper / len(strata))
-    return found
+        drawn.lower.append(low + (high - low) * lower / len(strata))
+        drawn.upper.append(low + (high - low) * upper / len(strata))
+    return drawn
 
 
 def _per_hour(events: int, exposure: float) -> dict[str, Any] | None:
@@ -308,8 +312,8 @@ def _per_hour(events: int, exposure: float) -> dict[str, Any] | None:
 
 
 def _comparison(
-    one: str,
-    other: str,
+    first_name: str,
+    second_name: str,
     first: Trials,
     second: Trials,
     alpha: float,
@@ -318,7 +322,7 @@ def _comparison(
 ) -> dict[str, Any]:
     counts = (*_counts(first), *_counts(second))
     pairs = _pairs(first, second) if in_pairs else []
-    told = [
+    consecutive = [
         pair for place, pair in enumerate(pairs) if int(pair[0].block) == place
     ]  # up to the first incomplete block
     statistic, p = methods.barnard(*counts)
@@ -327,8 +331,8 @@ def _comparison(
         sum(b.success and not a.success for a, b in pairs),
     )
     return {
-        "first": one,
-        "second": other,
+        "first": first_name,
+        "second": second_name,
         "difference": {"value": _rate(first) - _rate(second), "newcombe": methods.newcombe(*counts)},
         "barnard": {"statistic": statistic, "p": p},
         "probability_better": methods.better(*counts),
@@ -347,19 +351,19 @@ def _comparison(
         "within": _within(first, second),
         "by_scene": _by_scene(first, second),
         "evidence": _evidence(
-            methods.success_bets([(b.success, a.success) for a, b in told]),
-            methods.success_bets([(a.success, b.success) for a, b in told]),
+            methods.success_bets([(b.success, a.success) for a, b in consecutive]),
+            methods.success_bets([(a.success, b.success) for a, b in consecutive]),
             alpha,
         ),
         "score_evidence": _evidence(
-            methods.score_bets([a.score - b.score for a, b in told]),
-            methods.score_bets([b.score - a.score for a, b in told]),
+            methods.score_bets([a.score - b.score for a, b in consecutive]),
+            methods.score_bets([b.score - a.score for a, b in consecutive]),
             alpha,
         ),
         "anytime": {
             "level": 1 - alpha,
-            "success": methods.anytime([a.success - b.success for a, b in told], alpha),
-            "score": methods.anytime([a.score - b.score for a, b in told], alpha),
+            "success": methods.anytime([a.success - b.success for a, b in consecutive], alpha),
+            "score": methods.anytime([a.score - b.score for a, b in consecutive], alpha),
         },
         "sooner": _sooner(pairs, timing),
     }
@@ -371,14 +375,22 @@ def _scores(differences: Sequence[float]) -> dict[str, Any]:
 
 
 def _pairs(first: Trials, second: Trials) -> list[tuple[Trial, Trial]]:
-    ours, theirs = {t.block: t for t in first}, {t.block: t for t in second}
-    pairs = [(ours[block], theirs[block]) for block in ours if block in theirs]
+    first_by_block, second_by_block = {t.block: t for t in first}, {t.block: t for t in second}
+    pairs = [
+        (first_by_block[block], second_by_block[block])
+        for block in first_by_block
+        if block in second_by_block
+    ]
     return sorted(pairs, key=lambda pair: int(pair[0].block))
 
 
 def _clustered(first: Trials, second: Trials) -> dict[str, Any] | None:
-    ours, theirs = (_by(arm, lambda t: t.condition) for arm in (first, second))
-    differences = [_rate(ours[key]) - _rate(theirs[key]) for key in ours if key in theirs]
+    first_by_condition, second_by_condition = (_by(arm, lambda t: t.condition) for arm in (first, second))
+    differences = [
+        _rate(first_by_condition[key]) - _rate(second_by_condition[key])
+        for key in first_by_condition
+        if key in second_by_condition
+    ]
     if len(differences) < 2:
         return None
     drawn = _drawn([[(d + 1) / 2 for d in differences]], -1.0, 1.0)
@@ -386,32 +398,35 @@ def _clustered(first: Trials, second: Trials) -> dict[str, Any] | None:
 
 
 def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
-    ours, theirs = (_by(arm, lambda t: t.scene) for arm in (first, second))
-    shared = [key for key in ours if key in theirs]
-    if len({*ours, *theirs}) < 2 or not shared:
+    first_by_scene, second_by_scene = (_by(arm, lambda t: t.scene) for arm in (first, second))
+    shared = [key for key in first_by_scene if key in second_by_scene]
+    if len({*first_by_scene, *second_by_scene}) < 2 or not shared:
         return None
-    return methods.mantel_haenszel([(*_counts(ours[key]), *_counts(theirs[key])) for key in shared])
+    return methods.mantel_haenszel(
+        [(*_counts(first_by_scene[key]), *_counts(second_by_scene[key])) for key in shared]
+    )
 
 
 def _tables(first: Trials, second: Trials, key: str) -> dict[str, tuple[int, int, int, int]]:
     """Return successes and trials of both in each stratum in which both were tried."""
-    ours, theirs = ({getattr(t, key): [] for t in arm} for arm in (first, second))
-    for arm, found in ((first, ours), (second, theirs)):
+    first_groups, second_groups = ({getattr(t, key): [] for t in arm} for arm in (first, second))
+    for arm, groups in ((first, first_groups), (second, second_groups)):
         for trial in arm:
-            found[getattr(trial, key)].append(trial)
+            groups[getattr(trial, key)].append(trial)
     return {
-        name: (*_counts(ours[name]), *_counts(theirs[name])) for name in sorted(ours.keys() & theirs.keys())
+        name: (*_counts(first_groups[name]), *_counts(second_groups[name]))
+        for name in sorted(first_groups.keys() & second_groups.keys())
     }
 
 
 def _within(first: Trials, second: Trials) -> dict[str, Any]:
-    found = {}
+    tests = {}
     for key in ("condition", "scene", "operator", "station"):
         tables = _tables(first, second, key)
         p = methods.exact_within(list(tables.values()))
         if p is not None:
-            found[key] = {"p": p, "strata": len(tables)}
-    return found
+            tests[key] = {"p": p, "strata": len(tables)}
+    return tests
 
 
 def _by_scene(first: Trials, second: Trials) -> dict[str, Any]:
@@ -426,10 +441,10 @@ def _by_scene(first: Trials, second: Trials) -> dict[str, Any]:
 
 
 def _sooner(pairs: Sequence[tuple[Trial, Trial]], timing: Timing) -> dict[str, Any] | None:
-    known = [pair for pair in pairs if len(timing.known(pair)) == 2]
-    if not known:
+    timed = [pair for pair in pairs if len(timing.known(pair)) == 2]
+    if not timed:
         return None
-    gains = [timing.time(a) - timing.time(b) for a, b in known]
+    gains = [timing.time(a) - timing.time(b) for a, b in timed]
     p = methods.sign_flips(gains, timing.until)
     return {"pairs": len(gains), "value_s": math.fsum(gains) / len(gains), "p": p}
 

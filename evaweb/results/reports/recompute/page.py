@@ -80,20 +80,20 @@ class Node:
         return plain("".join(self._texts()))
 
     def _texts(self) -> Iterator[str]:
-        for each in self.inner:
-            if isinstance(each, str):
-                yield each
-            elif each.tag not in _UNREAD:
-                yield from each._texts()
-                yield " " if each.tag in ("br", "p", "li", "td", "th", "div", "dd", "dt") else ""
+        for part in self.inner:
+            if isinstance(part, str):
+                yield part
+            elif part.tag not in _UNREAD:
+                yield from part._texts()
+                yield " " if part.tag in ("br", "p", "li", "td", "th", "div", "dd", "dt") else ""
 
     def all(self, *tags: str) -> Iterator[Node]:
         """Yield the descendants that have one of these tags, or all without tags, in document order."""
-        for each in self.inner:
-            if isinstance(each, Node):
-                if not tags or each.tag in tags:
-                    yield each
-                yield from each.all(*tags)
+        for part in self.inner:
+            if isinstance(part, Node):
+                if not tags or part.tag in tags:
+                    yield part
+                yield from part.all(*tags)
 
 
 class _Reader(HTMLParser):
@@ -139,62 +139,66 @@ def read(page: str, styles: str | None) -> tuple[Node, list[str]]:
     reader = _Reader()
     reader.feed(re.sub(r"^\s*<!doctype html>", "", page, flags=re.IGNORECASE))
     reader.close()
-    found = [f"index.html: {fault}" for fault in reader.faults]
+    sentences = [f"index.html: {fault}" for fault in reader.faults]
     if "<!" in re.sub(r"^\s*<!doctype html>", "", page, flags=re.IGNORECASE):
-        found.append("index.html has a comment")
+        sentences.append("index.html has a comment")
     sheets = ["".join(map(str, node.inner)) for node in reader.root.all("style")]
     if len(sheets) != 1 or (styles is not None and sheets[0] != styles):
-        found.append("index.html has another style than the report's own")
+        sentences.append("index.html has another style than the report's own")
     hiding = _hiding("".join(sheets))
     for node in reader.root.all():
         allowed = _ATTRIBUTES | (_OF_A_DRAWING if node.tag in _DRAWN else frozenset())
         odd = sorted(set(node.attributes) - allowed) + sorted(node.classes & hiding)
         if node.tag not in _TAGS:
-            found.append(f"index.html has <{node.tag}>, which no report has")
+            sentences.append(f"index.html has <{node.tag}>, which no report has")
         elif odd:
-            found.append(f"index.html has <{node.tag} {odd[0]}>, which no report has")
+            sentences.append(f"index.html has <{node.tag} {odd[0]}>, which no report has")
         href = node.attributes.get("href")
         if href is not None and not _PICTURE.fullmatch(href):
-            found.append(f"index.html leads to {href}")
-    return reader.root, found
+            sentences.append(f"index.html leads to {href}")
+    return reader.root, sentences
 
 
 def _hiding(styles: str) -> set[str]:
     """Return the classes whose style hides their elements."""
-    found: set[str] = set()
+    classes: set[str] = set()
     for selectors, rules in re.findall(r"([^{}]+)\{([^{}]*)\}", styles):
         if _HIDES.search(rules):
             for selector in selectors.split(","):
                 last = re.split(r"[\s>+~]", selector.strip())[-1]
-                found.update(re.findall(r"\.([\w-]+)", last) if ":" not in last else ())
-    return found
+                classes.update(re.findall(r"\.([\w-]+)", last) if ":" not in last else ())
+    return classes
 
 
 def page_contradictions(
     root: Node, seal: Mapping[str, Any], plan: Mapping[str, Any], shown: Mapping[str, Any]
 ) -> list[str]:
     """Return differences between the page's statements and the reveal, the plan and numbers.json."""
-    kept, text = seal["at_reveal"] or {}, root.text
-    found = []
-    if "headline" in kept:  # from format 6 on
-        for what, given, wanted in (
-            ("headline", _sentences(root), [f"{one}." for one in kept["headline"]]),
-            ("reasons for doubt", _listed(root, _DOUBTS), [f"{one}." for one in kept.get("caveats", ())]),
+    reveal, text = seal["at_reveal"] or {}, root.text
+    sentences = []
+    if "headline" in reveal:  # from format 6 on
+        for label, texts, expected in (
+            ("headline", _sentences(root), [f"{sentence}." for sentence in reveal["headline"]]),
+            (
+                "reasons for doubt",
+                _listed(root, _DOUBTS),
+                [f"{sentence}." for sentence in reveal.get("caveats", ())],
+            ),
         ):
-            if given != list(map(plain, wanted)):
-                found.append(f"index.html does not say: {wanted or f'no {what}'}, but {given}")
-        if plain(kept.get("setting", "")) not in text:
-            found.append(f"index.html does not say: {kept['setting']}")
+            if texts != list(map(plain, expected)):
+                sentences.append(f"index.html does not say: {expected or f'no {label}'}, but {texts}")
+        if plain(reveal.get("setting", "")) not in text:
+            sentences.append(f"index.html does not say: {reveal['setting']}")
     shows_key = any(node.text == "Key" for node in root.all("dt"))
     if bool(seal["key"]) != shows_key or ("State: revealed" in text and not seal["key"]):
-        found.append("index.html says of reveal and key otherwise than seal.json")
+        sentences.append("index.html says of reveal and key otherwise than seal.json")
     digests = [node.text for node in root.all("dd") if "mono" in node.classes]
     if digests != [value for value in (seal["digest"], seal["commitment"], seal["key"]) if value]:
-        found.append("index.html has another digest, commitment or key than seal.json")
+        sentences.append("index.html has another digest, commitment or key than seal.json")
     if f"from {shown['n']} trials" not in text:
-        found.append(f"index.html does not say that it is made from {shown['n']} trials")
-    unsaid = (words for words in _planned(plan) if plain(words) not in text)
-    return found + [f"index.html does not say of the plan: {words}" for words in unsaid]
+        sentences.append(f"index.html does not say that it is made from {shown['n']} trials")
+    unsaid = (phrase for phrase in _planned(plan) if plain(phrase) not in text)
+    return sentences + [f"index.html does not say of the plan: {phrase}" for phrase in unsaid]
 
 
 def _planned(plan: Mapping[str, Any]) -> Iterator[str]:
@@ -208,8 +212,8 @@ def _planned(plan: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _sentences(root: Node) -> list[str]:
-    found = [node for node in root.all() if _SAID in node.classes]
-    return [text for node in found for text in ([li.text for li in node.all("li")] or [node.text])]
+    nodes = [node for node in root.all() if _SAID in node.classes]
+    return [text for node in nodes for text in ([li.text for li in node.all("li")] or [node.text])]
 
 
 def _listed(root: Node, heading: str) -> list[str]:
@@ -226,7 +230,8 @@ def below(root: Node, *head: str) -> list[list[str]]:
     [] if there is no such table. If there are several, the result is one row that matches no expected row.
     """
     tables = [
-        [[cell.text for cell in row.all("th", "td")] for row in one.all("tr")] for one in root.all("table")
+        [[cell.text for cell in row.all("th", "td")] for row in table.all("tr")]
+        for table in root.all("table")
     ]
     own = [rows for rows in tables if rows and rows[0][: len(head)] == [*head]]
     return own[0][1:] if len(own) == 1 else [["two tables"]] if own else []
@@ -237,7 +242,7 @@ def cells_fit(given: Sequence[str], wanted: Sequence[str], later: bool) -> bool:
 
     If scores came `later`, a text on later corrections may follow the rate in the first cell.
     """
-    rate, *rest = given or [""]
-    return list(rest) == list(wanted[1:]) and (
+    rate, *further = given or [""]
+    return list(further) == list(wanted[1:]) and (
         rate == wanted[0] or (later and rate.startswith(f"{wanted[0]} with later corrections "))
     )

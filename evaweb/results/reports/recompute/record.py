@@ -29,40 +29,46 @@ Rows = Sequence[Mapping[str, str]]
 
 def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
     """Return gaps: missing trials, attempts, scores and corrections."""
-    found = _missing("trials.csv lacks the trial handed out as number", [int(row["order"]) for row in rows])
+    sentences = _missing(
+        "trials.csv lacks the trial handed out as number", [int(row["order"]) for row in rows]
+    )
     attempts: dict[str, list[int]] = defaultdict(list)
     for row in rows:
         attempts[row["slot"]].append(int(row["attempt"]))
     for slot, numbers in attempts.items():
-        found += _missing(f"slot {slot} of the schedule lacks attempt", numbers)
-    given: dict[str, list[Mapping[str, str]]] = defaultdict(list)
+        sentences += _missing(f"slot {slot} of the schedule lacks attempt", numbers)
+    by_trial: dict[str, list[Mapping[str, str]]] = defaultdict(list)
     for score in scores:
-        given[score["trial"]].append(score)
-    for trial, told in given.items():
-        found += [
-            f"trial {trial} has a correction and no score before it" for score in told[:1] if score["reason"]
+        by_trial[score["trial"]].append(score)
+    for trial, own_scores in by_trial.items():
+        sentences += [
+            f"trial {trial} has a correction and no score before it"
+            for score in own_scores[:1]
+            if score["reason"]
         ]
-        found += [
-            f"trial {trial} has a correction without a reason" for score in told[1:] if not score["reason"]
+        sentences += [
+            f"trial {trial} has a correction without a reason"
+            for score in own_scores[1:]
+            if not score["reason"]
         ]
     told_of = {str(row["trial_id"]) for row in record.get("corrections", ())}
-    found += [
+    sentences += [
         f"integrity.json does not have the correction of trial {trial}"
-        for trial, told in given.items()
-        if len(told) > 1 and trial not in told_of
+        for trial, own_scores in by_trial.items()
+        if len(own_scores) > 1 and trial not in told_of
     ]
-    return found + list(_counts(rows, given, record)) + list(_copies(rows, given))
+    return sentences + list(_counts(rows, by_trial, record)) + list(_copies(rows, by_trial))
 
 
-def _counts(rows: Rows, given: Mapping[str, Rows], record: Mapping[str, Any]) -> Iterator[str]:
+def _counts(rows: Rows, by_trial: Mapping[str, Rows], record: Mapping[str, Any]) -> Iterator[str]:
     """Yield the counts by checkpoint in integrity.json that differ from the tables."""
     by = {row["checkpoint"]: row for row in record.get("checkpoints", ())}
     for name in sorted({row["checkpoint"] for row in rows}):
         own = [row for row in rows if row["checkpoint"] == name]
         turned = [
-            (one["success"], other["success"])
+            (earlier["success"], later["success"])
             for row in own
-            for one, other in pairwise(given.get(row["trial"], ()))
+            for earlier, later in pairwise(by_trial.get(row["trial"], ()))
         ]
         statuses = Counter(row["status"] for row in own)
         counts = {
@@ -76,28 +82,32 @@ def _counts(rows: Rows, given: Mapping[str, Rows], record: Mapping[str, Any]) ->
             "to_success": turned.count(("false", "true")),
             "to_failure": turned.count(("true", "false")),
         }
-        said = by.get(name, {})
-        counts |= {what: sum(row.get("ended_by") == what for row in own) for what in ENDED if what in said}
-        for what, number in counts.items():
-            if said.get(what) != number:
-                words = what.replace("_", " ")
-                yield f"{number} trials of {name} are {words}, integrity.json says {said.get(what)}"
+        stated = by.get(name, {})
+        counts |= {key: sum(row.get("ended_by") == key for row in own) for key in ENDED if key in stated}
+        for key, number in counts.items():
+            if stated.get(key) != number:
+                label = key.replace("_", " ")
+                yield f"{number} trials of {name} are {label}, integrity.json says {stated.get(key)}"
     voided = {row["trial"] for row in rows if row["status"] in ("voided", "void_asked")}
-    told = {str(row["trial_id"]) for row in record.get("voids", ())}
-    yield from (f"integrity.json does not have the void of trial {trial}" for trial in sorted(voided - told))
+    recorded = {str(row["trial_id"]) for row in record.get("voids", ())}
+    yield from (
+        f"integrity.json does not have the void of trial {trial}" for trial in sorted(voided - recorded)
+    )
     broken = {row["trial"] for row in rows if row["status"] in ("interrupted", "abandoned")}
-    told = {str(row["trial_id"]) for row in record.get("broken_off", ())}
-    yield from (f"integrity.json does not have the end of trial {trial}" for trial in sorted(broken - told))
+    recorded = {str(row["trial_id"]) for row in record.get("broken_off", ())}
+    yield from (
+        f"integrity.json does not have the end of trial {trial}" for trial in sorted(broken - recorded)
+    )
 
 
-def _copies(rows: Rows, given: Mapping[str, Rows]) -> Iterator[str]:
+def _copies(rows: Rows, by_trial: Mapping[str, Rows]) -> Iterator[str]:
     """Yield values in trials.csv that differ from the score that counts in scores.csv."""
     for row in rows:
-        if row["status"] == "scored" and (scores := given.get(row["trial"])):
+        if row["status"] == "scored" and (scores := by_trial.get(row["trial"])):
             for name in SCORE:
                 if name in row and name not in ("trial", "reason") and row[name] != scores[-1][name]:
-                    said, wanted = row[name], scores[-1][name]
-                    yield f"trials.csv says of trial {row['trial']} {name} = {said!r}, its score {wanted!r}"
+                    cell, scored = row[name], scores[-1][name]
+                    yield f"trials.csv says of trial {row['trial']} {name} = {cell!r}, its score {scored!r}"
 
 
 def changes(
@@ -111,53 +121,55 @@ def changes(
 
     `judged` are the tables of raters and judges.
     """
-    kept = seal["at_reveal"]
-    if not kept:
+    reveal = seal["at_reveal"]
+    if not reveal:
         return []
-    found = [] if seal["key"] else ["what counts was kept, and seal.json has no key"]
-    if "record" not in kept:  # plans up to format 5
-        return found
-    then = datetime.fromisoformat(kept["at"])
+    sentences = [] if seal["key"] else ["what counts was kept, and seal.json has no key"]
+    if "record" not in reveal:  # plans up to format 5
+        return sentences
+    then = datetime.fromisoformat(reveal["at"])
     attempts = [
         [*(row[name] for name in ATTEMPT), row["reason"] if row["status"] == "voided" else ""] for row in rows
     ]
-    said = [
+    stated = [
         [row[name] for name in SCORE] for row in scores if datetime.fromisoformat(row["scored_at"]) <= then
     ]
-    if digest({"attempts": attempts, "scores": said}) != kept["record"]:
-        found.append("attempts, scores, reasons or times are not those of which the reveal kept the digest")
-    if "measured" in kept:  # not recorded by earlier reveals
-        names = kept["measured"].get("names", MEASURED)
-        later = {str(trial) for trial in kept["measured"]["later"]}
+    if digest({"attempts": attempts, "scores": stated}) != reveal["record"]:
+        sentences.append(
+            "attempts, scores, reasons or times are not those of which the reveal kept the digest"
+        )
+    if "measured" in reveal:  # not recorded by earlier reveals
+        names = reveal["measured"].get("names", MEASURED)
+        later = {str(trial) for trial in reveal["measured"]["later"]}
         values = [
             [row[name] for name in (*names, *(() if row["trial"] in later else LOOKED_AT))] for row in rows
         ]
-        if digest(values) != kept["measured"]["digest"]:
-            found.append(
+        if digest(values) != reveal["measured"]["digest"]:
+            sentences.append(
                 "durations, smoothness or what ended a run are not those of which the reveal kept the digest"
             )
-    if "judged" in kept:  # from format 7 on
-        told = {
+    if "judged" in reveal:  # from format 7 on
+        judged_values = {
             name: [[*row.values()] for row in table if datetime.fromisoformat(row["at"]) <= then]
             for name, table in judged.items()
         }
-        if digest(told) != kept["judged"]:
-            found.append(
+        if digest(judged_values) != reveal["judged"]:
+            sentences.append(
                 "ratings, preferences or judgements are not those of which the reveal kept the digest"
             )
-        if digest({name: record.get(name) for name in STAYS}) != kept["conduct"]:
-            found.append(
+        if digest({name: record.get(name) for name in STAYS}) != reveal["conduct"]:
+            sentences.append(
                 "integrity.json is not that of which the reveal kept the digest: " + ", ".join(STAYS)
             )
-    said = ". ".join(kept.get("headline", ()))
-    if any(row.get("headline", said) != said for row in rows):
-        found.append("trials.csv has another headline than the reveal")
-    return found
+    stated = ". ".join(reveal.get("headline", ()))
+    if any(row.get("headline", stated) != stated for row in rows):
+        sentences.append("trials.csv has another headline than the reveal")
+    return sentences
 
 
-def _missing(what: str, numbers: Sequence[int]) -> list[str]:
-    wanted = set(range(1, max(numbers, default=0) + 1))
-    twice = {number for number in numbers if list(numbers).count(number) > 1}
-    return [f"{what} {number}" for number in sorted(wanted - set(numbers))] + [
-        f"{what} {number} alone: it is there twice" for number in sorted(twice)
+def _missing(label: str, numbers: Sequence[int]) -> list[str]:
+    expected = set(range(1, max(numbers, default=0) + 1))
+    repeated = {number for number in numbers if list(numbers).count(number) > 1}
+    return [f"{label} {number}" for number in sorted(expected - set(numbers))] + [
+        f"{label} {number} alone: it is there twice" for number in sorted(repeated)
     ]

@@ -21,11 +21,13 @@ def scene_faults(
     counts = plan.get("counts_as", {})
     fails = {row["trial"] for row in rows if counts.get(f"on_{row.get('ended_by', '')}") == "failure"}
     return [
-        f"trial {said['trial']}, judged by {said['rater']}: {fault}"
-        for one in judged
-        for said in one
-        if said["trial"] in played
-        for fault in _faults(said, scenes.get(played[said["trial"]], []), said["trial"] in fails)
+        f"trial {judged_row['trial']}, judged by {judged_row['rater']}: {fault}"
+        for judged_rows in judged
+        for judged_row in judged_rows
+        if judged_row["trial"] in played
+        for fault in _faults(
+            judged_row, scenes.get(played[judged_row["trial"]], []), judged_row["trial"] in fails
+        )
     ]
 
 
@@ -33,33 +35,39 @@ def ending_faults(plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) ->
     """Return runs with an abnormal end that do not count as the plan requires."""
     counts = plan.get("counts_as", {})
     last = {row["slot"]: int(row["attempt"]) for row in sorted(rows, key=lambda row: int(row["attempt"]))}
-    found = []
+    sentences = []
     for row in rows:
         by = row.get("ended_by", "")
         rule = counts.get(f"on_{by}", "judged")
         if rule == "repeated" and row["status"] == "scored":
-            found.append(f"trial {row['trial']} counts, its end ({by}) is repeated by the plan")
+            sentences.append(f"trial {row['trial']} counts, its end ({by}) is repeated by the plan")
         if rule == "failure" and row["status"] == "scored" and row["success"] == "true":
-            found.append(f"trial {row['trial']} is a success, its end ({by}) is a failure by the plan")
+            sentences.append(f"trial {row['trial']} is a success, its end ({by}) is a failure by the plan")
         nothing = row.get("frames", "1") in ("", "0")  # without frames it could not be scored
-        again = row["status"] == "interrupted" and int(row["attempt"]) < last[row["slot"]]
-        if rule == "failure" and again and not nothing:
-            found.append(f"trial {row['trial']} was repeated, its end ({by}) is a failure by the plan")
-    return found
+        was_repeated = row["status"] == "interrupted" and int(row["attempt"]) < last[row["slot"]]
+        if rule == "failure" and was_repeated and not nothing:
+            sentences.append(f"trial {row['trial']} was repeated, its end ({by}) is a failure by the plan")
+    return sentences
 
 
-def _faults(said: Mapping[str, str], milestones: Sequence[Mapping[str, Any]], fails: bool) -> Iterator[str]:
-    reached = json.loads(said["milestones"] or "[]")
+def _faults(
+    judged_row: Mapping[str, str], milestones: Sequence[Mapping[str, Any]], fails: bool
+) -> Iterator[str]:
+    reached = json.loads(judged_row["milestones"] or "[]")
     if [text for text, _ in reached] != [row["text"] for row in milestones]:
         yield "its milestones are not those of the plan"
         return
-    ticks = [bool(done) for _, done in reached]
-    success = said["success"] == "true"
-    required = [done for done, row in zip(ticks, milestones, strict=True) if row["required"]]
+    ticks = [bool(is_reached) for _, is_reached in reached]
+    success = judged_row["success"] == "true"
+    required = [is_reached for is_reached, row in zip(ticks, milestones, strict=True) if row["required"]]
     if required and not fails and success != all(required):
         yield f"success is {success}, its required milestones say {all(required)}"
     points = [row["points"] for row in milestones]
     total = sum(points)
-    share = sum(p for p, done in zip(points, ticks, strict=True) if done) / total if total else float(success)
-    if not math.isclose(float(said["score"]), share, abs_tol=1e-9):
-        yield f"its score is {said['score']}, the plan's points give {share:g}"
+    share = (
+        sum(p for p, is_reached in zip(points, ticks, strict=True) if is_reached) / total
+        if total
+        else float(success)
+    )
+    if not math.isclose(float(judged_row["score"]), share, abs_tol=1e-9):
+        yield f"its score is {judged_row['score']}, the plan's points give {share:g}"

@@ -57,11 +57,11 @@ def _below(draws: Iterator[int], n: int) -> int:
 
 
 def _shuffled(draws: Iterator[int], items: Sequence[Any]) -> list[Any]:
-    found = list(items)
-    for i in reversed(range(1, len(found))):
+    shuffled = list(items)
+    for i in reversed(range(1, len(shuffled))):
         j = _below(draws, i + 1)
-        found[i], found[j] = found[j], found[i]
-    return found
+        shuffled[i], shuffled[j] = shuffled[j], shuffled[i]
+    return shuffled
 
 
 def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
@@ -103,52 +103,60 @@ def counts(units: Sequence[Sequence[Any]], names: Sequence[str]) -> list[list[in
 
 def codes(key: bytes, count: int) -> list[str]:
     """Return the codes in order of allocation."""
-    draws, found = _draws(key, "codes"), dict[str, None]()
-    while len(found) < count:
-        found["".join(_LETTERS[_below(draws, len(_LETTERS))] for _ in range(5))] = None
-    return list(found)
+    draws, drawn = _draws(key, "codes"), dict[str, None]()
+    while len(drawn) < count:
+        drawn["".join(_LETTERS[_below(draws, len(_LETTERS))] for _ in range(5))] = None
+    return list(drawn)
 
 
 def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> list[str]:
     """Return contradictions between plan, commitment, key and trials."""
-    found = []
+    sentences = []
     if digest(plan) != seal["digest"]:
-        found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
-    kept = seal["at_reveal"]
-    said = {name: kept[name] for name in _KEPT if name in kept} if kept else {}  # parts covered by the digest
-    if kept and digest({"plan": seal["digest"], **said}) != kept["digest"]:
-        found.append(f"the pairs of the reveal have not the digest {kept['digest']}")
+        sentences.append(
+            f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}"
+        )
+    reveal = seal["at_reveal"]
+    fields = (
+        {name: reveal[name] for name in _KEPT if name in reveal} if reveal else {}
+    )  # parts covered by the digest
+    if reveal and digest({"plan": seal["digest"], **fields}) != reveal["digest"]:
+        sentences.append(f"the pairs of the reveal have not the digest {reveal['digest']}")
     if not seal["key"]:
-        return found
+        return sentences
     version = plan.get(
         "format", 1
     )  # reveals record a digest from format 3 on, blocks and arms from 4 on, texts from 6 on
     kinds = () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
     kinds += ("headline", "caveats", "record") if version >= 6 else ()
     kinds += ("setting", "measured", "judged", "conduct") if version >= _ALL_KEPT else ()
-    wanted = kinds if arms_of(plan) or version >= _ALL_KEPT else ()
-    found += [f"the reveal kept no {name}" for name in wanted if name not in (kept or {})]
+    required = kinds if arms_of(plan) or version >= _ALL_KEPT else ()
+    sentences += [f"the reveal kept no {name}" for name in required if name not in (reveal or {})]
     key = bytes.fromhex(seal["key"])
     units = schedule(plan, key)
     committed = hmac.new(key, f"{seal['digest']}\n{digest({'units': units})}".encode(), hashlib.sha256)
     if (
-        kept
-        and kept.get("key", seal["key"]) == seal["key"]
-        and kept.get("commitment", seal["commitment"]) != seal["commitment"]
+        reveal
+        and reveal.get("key", seal["key"]) == seal["key"]
+        and reveal.get("commitment", seal["commitment"]) != seal["commitment"]
     ):
-        found.append(f"the reveal was of the commitment {kept['commitment']}, shown is {seal['commitment']}")
+        sentences.append(
+            f"the reveal was of the commitment {reveal['commitment']}, shown is {seal['commitment']}"
+        )
     if committed.hexdigest() != seal["commitment"]:
-        found.append(f"the key makes the commitment {committed.hexdigest()}, shown was {seal['commitment']}")
-    shown, names = (
+        sentences.append(
+            f"the key makes the commitment {committed.hexdigest()}, shown was {seal['commitment']}"
+        )
+    planned_counts, names = (
         plan["stopping"].get("counts"),
         arms_of(plan) or [row["name"] for row in plan["checkpoints"]],
     )
-    if shown and shown != counts(units, names):
-        found.append("the boundary is for other numbers of trials than those of the schedule")
-    known = codes(key, max((int(row["order"]) for row in rows), default=0))
+    if planned_counts and planned_counts != counts(units, names):
+        sentences.append("the boundary is for other numbers of trials than those of the schedule")
+    code_list = codes(key, max((int(row["order"]) for row in rows), default=0))
     for row in rows:
         unit = units[int(row["slot"])]
-        said = [int(row["slot"]), int(row["block"]), row["checkpoint"], row["scene"], int(row["position"])]
-        if unit[:5] != said or row["code"] != known[int(row["order"]) - 1]:
-            found.append(f"trial {row['trial']} ({row['code']}) is not what the schedule foresaw: {unit}")
-    return found
+        fields = [int(row["slot"]), int(row["block"]), row["checkpoint"], row["scene"], int(row["position"])]
+        if unit[:5] != fields or row["code"] != code_list[int(row["order"]) - 1]:
+            sentences.append(f"trial {row['trial']} ({row['code']}) is not what the schedule foresaw: {unit}")
+    return sentences

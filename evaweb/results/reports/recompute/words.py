@@ -21,33 +21,33 @@ def headline_faults(
     """
     if plan.get("format", 1) < _FROM or not said:
         return []
-    left, found = list(told), []
-    for one in said:
-        ways = list(_ways(one, blocks, plan))
-        ours = [sentence for sentence in left if sentence.startswith(tuple(ways))]
-        if ours:
-            left.remove(ours[0])
+    left, faults = list(told), []
+    for conclusion in said:
+        beginnings = list(_ways(conclusion, blocks, plan))
+        matching = [sentence for sentence in left if sentence.startswith(tuple(beginnings))]
+        if matching:
+            left.remove(matching[0])
         else:
-            found.append(f"headline: no sentence begins {' or '.join(map(repr, ways))}")
+            faults.append(f"headline: no sentence begins {' or '.join(map(repr, beginnings))}")
     best = _best(said, plan)
-    if best and (ours := [sentence for sentence in left if sentence.startswith(best)]):
-        left.remove(ours[0])
+    if best and (matching := [sentence for sentence in left if sentence.startswith(best)]):
+        left.remove(matching[0])
     elif best:
-        found.append(f"headline: no sentence begins {best!r}")
-    return found + [f"headline: nothing comes out as {sentence!r}" for sentence in left]
+        faults.append(f"headline: no sentence begins {best!r}")
+    return faults + [f"headline: nothing comes out as {sentence!r}" for sentence in left]
 
 
-def _ways(one: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, Any]) -> Iterator[str]:
+def _ways(conclusion: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, Any]) -> Iterator[str]:
     """Yield the possible beginnings of the headline's sentence on one comparison, with its counts."""
-    first, second, stopping = one["first"], one["second"], plan["stopping"]
-    if one["at"] is None:
-        yield f"{first} and {second} were not compared: closed after {one['blocks']} of "
-        yield f"{first} and {second} would not be compared yet after {one['blocks']} of "
+    first, second, stopping = conclusion["first"], conclusion["second"], plan["stopping"]
+    if conclusion["at"] is None:
+        yield f"{first} and {second} were not compared: closed after {conclusion['blocks']} of "
+        yield f"{first} and {second} would not be compared yet after {conclusion['blocks']} of "
         return
-    better, worse = (second, first) if one["winner"] == second else (first, second)
+    better, worse = (second, first) if conclusion["winner"] == second else (first, second)
     arms, margin = arms_of(plan), stopping.get("margin")
     sides = [
-        [value for block in blocks[: one["at"]] for arm, value in block if arms[arm] == name]
+        [value for block in blocks[: conclusion["at"]] for arm, value in block if arms[arm] == name]
         for name in (better, worse)
     ]
     counts = " against ".join(f"{sum(side):.0f}/{len(side)}" for side in sides)
@@ -56,14 +56,14 @@ def _ways(one: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, An
         means = (f"{sum(side) / len(side):.2f}" for side in sides)
         counts = f"mean scores {' and '.join(means)}"
     if margin is not None:
-        shown = "" if one["winner"] else "not shown to be "
-        yield f"{first} is {shown}not worse than {second} by {100 * margin:g} points or more: {counts}"
-    elif one["winner"] is None:
+        negation = "" if conclusion["winner"] else "not shown to be "
+        yield f"{first} is {negation}not worse than {second} by {100 * margin:g} points or more: {counts}"
+    elif conclusion["winner"] is None:
         yield f"No significant difference between {first} and {second}: {counts}"
-        yield f"Undecided: {one['at']} {_unit(plan)} cannot tell {first} and {second} apart: {counts}"
+        yield f"Undecided: {conclusion['at']} {_unit(plan)} cannot tell {first} and {second} apart: {counts}"
     elif not by_score:
         yield f"{better} succeeded more often than {worse}: {counts}"
-    elif one["p"] is not None:  # sign-flip tests show only that the two are not exchangeable
+    elif conclusion["p"] is not None:  # sign-flip tests show only that the two are not exchangeable
         yield f"Scores of {better} and {worse} differ: {counts}"
     else:
         yield f"{better} reached higher scores than {worse}: {counts}"
@@ -73,15 +73,24 @@ def _unit(plan: Mapping[str, Any]) -> str:
     return "blocks" if plan["stopping"].get("counts") else "pairs"
 
 
-def _best(said: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
+def _best(conclusions: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
     """Return the beginning of the headline's sentence on the best of all checkpoints; "" if it must not have one."""
     arms, stopping = arms_of(plan), plan["stopping"]
-    of_all = len(arms) > 2 and 2 * len(said) == len(arms) * (len(arms) - 1)
-    differ = stopping.get("outcome") == "score" and any(one["p"] is not None for one in said)
-    if not of_all or differ or stopping.get("margin") is not None or any(one["at"] is None for one in said):
+    of_all = len(arms) > 2 and 2 * len(conclusions) == len(arms) * (len(arms) - 1)
+    differ = stopping.get("outcome") == "score" and any(
+        conclusion["p"] is not None for conclusion in conclusions
+    )
+    if (
+        not of_all
+        or differ
+        or stopping.get("margin") is not None
+        or any(conclusion["at"] is None for conclusion in conclusions)
+    ):
         return ""
     beaten = {
-        one["first"] if one["winner"] == one["second"] else one["second"] for one in said if one["winner"]
+        conclusion["first"] if conclusion["winner"] == conclusion["second"] else conclusion["second"]
+        for conclusion in conclusions
+        if conclusion["winner"]
     }
     left = [arm for arm in arms if arm not in beaten]
     if len(left) == 1:
@@ -97,26 +106,30 @@ def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], l
     If scores came `later` than the reveal, the page may state corrections.
     """
     arms = {row[0]: row[1:] for row in below(root, "Checkpoint", "Groups")}
-    found = []
+    faults = []
     for name, arm in shown["arms"].items():
-        given, wanted = arms.pop(plain(name), []), _cells(arm)
+        cells, expected = arms.pop(plain(name), []), _cells(arm)
         letter = shown["letters"].get(name, "")
-        if not given or given[0] != letter or not cells_fit(given[1:], wanted, later):
-            found.append(f"index.html says of {name} {given or 'nothing'}, numbers.json {[letter, *wanted]}")
-    found += [f"index.html has {name} among the checkpoints" for name in arms]
+        if not cells or cells[0] != letter or not cells_fit(cells[1:], expected, later):
+            faults.append(
+                f"index.html says of {name} {cells or 'nothing'}, numbers.json {[letter, *expected]}"
+            )
+    faults += [f"index.html has {name} among the checkpoints" for name in arms]
     counted = [trial for trial in trials if trial.status == "scored"]
     rows = {row[0]: row[1:] for row in below(root, "#", "Checkpoint", "Condition")}
     for trial in counted:
         row = rows.pop(str(trial.order), [])
-        wanted = [plain(trial.checkpoint), plain(trial.condition), "yes" if trial.success else "no"]
-        known = (trial.score, 2), (trial.duration, 1)
-        fits = len(row) > 6 and row[:3] == wanted and row[-1] == plain(f"{trial.station}, {trial.operator}")
+        expected = [plain(trial.checkpoint), plain(trial.condition), "yes" if trial.success else "no"]
+        rounded = (trial.score, 2), (trial.duration, 1)
+        fits = len(row) > 6 and row[:3] == expected and row[-1] == plain(f"{trial.station}, {trial.operator}")
         if not fits or not all(
-            _is_rounded(cell, *value) for cell, value in zip(row[3:5], known, strict=True)
+            _is_rounded(cell, *value) for cell, value in zip(row[3:5], rounded, strict=True)
         ):
-            said = ", ".join(map(str, (*wanted, trial.score, trial.duration, trial.station, trial.operator)))
-            found.append(f"index.html does not say of trial {trial.order}: {said}")
-    return found + [f"index.html has a trial {order}, which does not count" for order in rows]
+            description = ", ".join(
+                map(str, (*expected, trial.score, trial.duration, trial.station, trial.operator))
+            )
+            faults.append(f"index.html does not say of trial {trial.order}: {description}")
+    return faults + [f"index.html has a trial {order}, which does not count" for order in rows]
 
 
 def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
@@ -140,28 +153,28 @@ def _cells(arm: Mapping[str, Any]) -> list[str]:
 
 
 def _time(arm: Mapping[str, Any]) -> str:
-    found = (arm.get("time_to_success") or {}).get("restricted_mean")
-    if not found:
+    mean = (arm.get("time_to_success") or {}).get("restricted_mean")
+    if not mean:
         return "–"
-    low, high = found["gaffke"]
-    return f"{found['value_s']:.1f} s [{low:.1f}, {high:.1f}], up to {found['until_s']:.0f} s"
+    low, high = mean["gaffke"]
+    return f"{mean['value_s']:.1f} s [{low:.1f}, {high:.1f}], up to {mean['until_s']:.0f} s"
 
 
 def _speed(arm: Mapping[str, Any]) -> str:
-    found = arm.get("successes_per_hour")
-    if not found:
+    rate = arm.get("successes_per_hour")
+    if not rate:
         return "–"
-    low, high = found["garwood"]
-    return f"{found['per_hour']:.1f} [{low:.1f}, {high:.1f}]"
+    low, high = rate["garwood"]
+    return f"{rate['per_hour']:.1f} [{low:.1f}, {high:.1f}]"
 
 
-def _average(found: Mapping[str, Any] | None, of: int) -> str:
-    if not found:
+def _average(average: Mapping[str, Any] | None, of: int) -> str:
+    if not average:
         return "–"
-    n = f"n {found['n']}" if found["n"] == of else f"{found['n']} of {of} trials"
-    if not found["student"]:
-        return f"{_decimal(found['mean'])}, {n}: no interval"
-    return f"{_decimal(found['mean'])} [{', '.join(map(_decimal, found['student']))}], {n}"
+    n = f"n {average['n']}" if average["n"] == of else f"{average['n']} of {of} trials"
+    if not average["student"]:
+        return f"{_decimal(average['mean'])}, {n}: no interval"
+    return f"{_decimal(average['mean'])} [{', '.join(map(_decimal, average['student']))}], {n}"
 
 
 def _decimal(value: float) -> str:
