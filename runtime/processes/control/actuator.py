@@ -138,12 +138,12 @@ class Actuator(ABC):
         self.engage(before + np.clip(measured - before, -np.asarray(farthest), farthest))
         self._note_step(before, self.commanded, why)
 
-    def _note_step(self, before: Float64, after: Float64, why: str) -> None:
+    def _note_step(self, before: Float64, after: Float64, cause: str) -> None:
         apart = np.where(self._settings.limits.position_mask, np.abs(after - before), 0.0)
         if apart.any():
             worst = int(apart.argmax())
             self._stepped = (
-                _STEPPED(why=why, joint=self._settings.limits.names[worst], distance=apart[worst]),
+                _STEPPED(why=cause, joint=self._settings.limits.names[worst], distance=apart[worst]),
             )
 
     @property
@@ -239,15 +239,15 @@ class RobotActuator(Actuator):
             previous_target=aim,
         )
 
-    def _unwrapped_joints(self, seen: LatestObservation) -> Float64:
+    def _unwrapped_joints(self, observation: LatestObservation) -> Float64:
         """Return the measured joints [D]; wrapping angles are shifted by whole turns to be nearest to the last command.
 
         The node may not count turns.
         """
         wrapping = self._settings.dims.wrapping
         if not wrapping or not self.engaged:
-            return seen.joints
-        return self.commanded + difference(seen.joints, self.commanded, wrapping)
+            return observation.joints
+        return self.commanded + difference(observation.joints, self.commanded, wrapping)
 
     def send_node_request(self, word: str, data: Mapping[str, Any]) -> str:
         """Send the control word `word` to the node; return the reason if it was not sent, "" if it was.

@@ -55,11 +55,11 @@ def build_strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy
     Raises:
         ConfigurationError: unknown kind or invalid parameters.
     """
-    known = variants("runtime.strategies")
+    modules = variants("runtime.strategies")
     kind = section.get("kind")
-    if not isinstance(kind, str) or kind not in known:
-        raise ConfigurationError(f"strategy.kind = {kind!r}; allowed: {', '.join(known)}")
-    module = known[kind]
+    if not isinstance(kind, str) or kind not in modules:
+        raise ConfigurationError(f"strategy.kind = {kind!r}; allowed: {', '.join(modules)}")
+    module = modules[kind]
     try:
         config = module.Config.model_validate(dict(section))
     except ValidationError as error:
@@ -161,8 +161,8 @@ class ExecuteChunks(Behaviour):
         begin = arrival.rows[0] if chunk.intended_start is None else chunk.intended_start.astype(np.float64)
         if begin.shape != (dim,):
             return JoinResult(dropped_chunk(chunk, step, _CHUNK_BEGIN(given=list(begin.shape), expected=dim)))
-        meant, where = self._first_action_distance(begin, commanded)
-        if meant > safety.jump:
+        distance, where = self._first_action_distance(begin, commanded)
+        if distance > safety.jump:
             reason = _TOO_FAR(where=where, allowed=safety.jump)
             return JoinResult(dropped_chunk(chunk, step, reason), reason, too_far=True)
         away, where = self._first_used_distance(arrival, step, commanded)
@@ -173,14 +173,14 @@ class ExecuteChunks(Behaviour):
         if away > safety.jump:
             reason = _TOO_FAR(where=where, allowed=safety.jump)
             return JoinResult(dropped_chunk(chunk, step, reason), reason, too_far=True)
-        held = commanded if away > _JOINED_AT_ONCE or self.is_starved else None
+        start = commanded if away > _JOINED_AT_ONCE or self.is_starved else None
         switched = self._switched
         merged = join(
             self._strategy.merge,
             self.timeline,
             arrival,
             step,
-            held,
+            start,
             self._settings.dims,
             joining=switched,
             commanded=commanded,

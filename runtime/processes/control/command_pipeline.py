@@ -201,30 +201,30 @@ class CommandPipeline:
             self._dwell.record_command(before, sent.executed, planned)
         return sent
 
-    def _drive(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
+    def _drive(self, step: int, planned: float, observation: LatestObservation) -> TickResult:
         run = self.run
         if run is not None and self._gap is not None:
-            return self._wait_for_joints(run, self._gap, step, planned, seen)
+            return self._wait_for_joints(run, self._gap, step, planned, observation)
         if run is not None and self._unseen:
-            self._check_joints_returned(run, step, planned, seen)
+            self._check_joints_returned(run, step, planned, observation)
         target = self.behaviour.target(step, self.actuator.elapsed(planned))
         if target is None:
-            return self._nothing_planned(step, planned, seen)
+            return self._nothing_planned(step, planned, observation)
         if target.path is None:
-            sent = self._send_hold(step, planned, target, seen)
+            sent = self._send_hold(step, planned, target, observation)
             self._standing = None  # another stop is sent now: the old one must not continue later
         else:
-            sent = self._judge(step, planned, target, seen)
+            sent = self._judge(step, planned, target, observation)
         if isinstance(self.behaviour, MoveTo):
             self._finish(self.behaviour, sent)
         return sent
 
-    def _judge(self, step: int, planned: float, target: Target, seen: LatestObservation) -> TickResult:
+    def _judge(self, step: int, planned: float, target: Target, observation: LatestObservation) -> TickResult:
         action, notes = self._apply_locks(target.action, planned)
-        state = self.actuator.state(seen, planned, self._aim)
+        state = self.actuator.state(observation, planned, self._aim)
         verdict = self._safety.judge(action, state, target.path or "policy")
         if verdict.action is None:
-            return self._refuse(step, planned, target, (*notes, *verdict.notes), seen)
+            return self._refuse(step, planned, target, (*notes, *verdict.notes), observation)
         self.refused, self._unseen, self._standing, self._aim = 0, 0, None, action
         self._verdicts.append(False)
         if self.run is not None and (gap := self.run.end_starvation(planned)) is not None:
@@ -234,7 +234,9 @@ class CommandPipeline:
             limited=verdict.largest_change_note, change=verdict.change, near=verdict.near_collision
         )
 
-    def _send_hold(self, step: int, planned: float, target: Target, seen: LatestObservation) -> TickResult:
+    def _send_hold(
+        self, step: int, planned: float, target: Target, observation: LatestObservation
+    ) -> TickResult:
         """Send a braking or held target without a safety check.
 
         A locked gripper that is not at its lock moves there within its limits.
@@ -243,28 +245,28 @@ class CommandPipeline:
         action = target.action
         notes: tuple[str, ...] = ()
         if target.source == "estop":
-            action = self._approach(action, seen, planned)
+            action = self._approach(action, observation, planned)
         else:
             locked, notes = self._apply_locks(action, planned)
             if notes:
-                action = np.where(self._locks.on, self._to_lock(locked, seen, planned), action)
+                action = np.where(self._locks.on, self._to_lock(locked, observation, planned), action)
         return self.actuator.send(step, planned, target, action, notes)
 
-    def _to_lock(self, locked: Float64, seen: LatestObservation, planned: float) -> Float64:
+    def _to_lock(self, locked: Float64, observation: LatestObservation, planned: float) -> Float64:
         """Move towards the positions of locked grippers [D] within the limits of generated motions.
 
         Stop instead if the robot's state is unknown.
         """
-        state = self.actuator.state(seen, planned, locked)
+        state = self.actuator.state(observation, planned, locked)
         if self._safety.unknown_state_reason(state):
             locked, state = state.previous, replace(state, previous_target=None)
         return self._safety.reachable(locked, state, "motion")
 
-    def _approach(self, where: Float64, seen: LatestObservation, planned: float) -> Float64:
+    def _approach(self, where: Float64, observation: LatestObservation, planned: float) -> Float64:
         """Move towards the position that the e-stop holds, within velocity limits; a mobile base stops at once."""
         if not self._settings.checks_measurements:
             return where
-        state = self.actuator.state(seen, planned, where)
+        state = self.actuator.state(observation, planned, where)
         reachable = self._safety.reachable(where, state).copy()
         reachable[list(self._settings.limits.speeds)] = where[list(self._settings.limits.speeds)]
         return reachable
@@ -274,8 +276,8 @@ class CommandPipeline:
         commanded = self.actuator.commanded
         action, locked = self._locks.apply(action)
         action = snap_grippers(self._settings.switches, action, commanded)
-        action, kept = self._dwell.apply(action, commanded, planned)
-        return action, (*locked, *kept)
+        action, dwelling = self._dwell.apply(action, commanded, planned)
+        return action, (*locked, *dwelling)
 
     def _refuse(
         self,
@@ -283,13 +285,13 @@ class CommandPipeline:
         planned: float,
         target: Target | None,
         notes: tuple[str, ...],
-        seen: LatestObservation,
+        observation: LatestObservation,
     ) -> TickResult:
-        run, unseen = self.run, self._safety.unseen(self.actuator.state(seen, planned, None))
+        run, unseen = self.run, self._safety.unseen(self.actuator.state(observation, planned, None))
         if self._unseen and not self._known():  # joints are back, and not yet trusted
             unseen = notes[-1]
         self.refused += 1
-        self._unseen_since = self._unseen_since if self._unseen else seen.joints_captured
+        self._unseen_since = self._unseen_since if self._unseen else observation.joints_captured
         self._unseen = self._unseen + 1 if unseen and run is not None else 0
         self._verdicts.append(True)
         self._braking_hold()
@@ -306,37 +308,39 @@ class CommandPipeline:
             seconds = self._settings.safety.joint_gap_s
             self._report.emit("joints_missing", _JOINTS_MISSING(why=unseen, seconds=seconds))
         else:
-            told = {"count": refused, "why": notes[-1]}
+            fields = {"count": refused, "why": notes[-1]}
             in_row, of = refused == self.refused, len(self._verdicts)
-            self.hold_because("refusals", _IN_A_ROW(**told) if in_row else _OF_THE_LAST(**told, of=of))
-        return self._send_braking(step, planned, seen)._replace(target=target, notes=notes, refused=True)
+            self.hold_because("refusals", _IN_A_ROW(**fields) if in_row else _OF_THE_LAST(**fields, of=of))
+        return self._send_braking(step, planned, observation)._replace(
+            target=target, notes=notes, refused=True
+        )
 
     def _wait_for_joints(
-        self, run: ExecuteChunks, gap: _Gap, step: int, planned: float, seen: LatestObservation
+        self, run: ExecuteChunks, gap: _Gap, step: int, planned: float, observation: LatestObservation
     ) -> TickResult:
         """Brake and wait until joints are fresh and trusted; then continue with the next chunk, or hold."""
-        state, why = self.actuator.state(seen, planned, None), ""
+        state, reason = self.actuator.state(observation, planned, None), ""
         allowed, unseen = self._settings.safety.joint_gap_s, self._safety.unseen(state)
         if unseen:
             gap.unseen = planned
         missing = gap.unseen - gap.since  # however old the joints are that arrive meanwhile
         if missing > allowed:
-            why = _IN_A_ROW(count=self.refused, why=unseen or _BACK_LATE(seconds=missing, allowed=allowed))
+            reason = _IN_A_ROW(count=self.refused, why=unseen or _BACK_LATE(seconds=missing, allowed=allowed))
         elif planned - gap.since > allowed + _BELIEVED_S:  # or control itself was stalled for so long
-            why = _NOT_BELIEVED(seconds=missing, why=state.implausible_reason or _DISAGREE)
+            reason = _NOT_BELIEVED(seconds=missing, why=state.implausible_reason or _DISAGREE)
         elif not unseen and not state.implausible_reason and self._believed():
-            why = self._elsewhere(state, missing)
-            if not why:
+            reason = self._elsewhere(state, missing)
+            if not reason:
                 self._go_on(run, missing)
-        if why:
-            self.hold_because("refusals", why)
-        return self._send_braking(step, planned, seen)._replace(refused=True)
+        if reason:
+            self.hold_because("refusals", reason)
+        return self._send_braking(step, planned, observation)._replace(refused=True)
 
     def _check_joints_returned(
-        self, run: ExecuteChunks, step: int, planned: float, seen: LatestObservation
+        self, run: ExecuteChunks, step: int, planned: float, observation: LatestObservation
     ) -> None:
         """Discard the plan if the joints are back after a short gap, but the plan went on without the robot."""
-        state = self.actuator.state(seen, planned, None)
+        state = self.actuator.state(observation, planned, None)
         if (
             not self._safety.unseen(state)
             and not state.implausible_reason
@@ -360,8 +364,8 @@ class CommandPipeline:
         worst = int(apart.argmax())
         if apart[worst] <= allowed:
             return ""
-        told = {"joint": limits.names[worst], "distance": apart[worst], "allowed": allowed}
-        return _BACK_ELSEWHERE(seconds=missing, **told)
+        fields = {"joint": limits.names[worst], "distance": apart[worst], "allowed": allowed}
+        return _BACK_ELSEWHERE(seconds=missing, **fields)
 
     def _go_on(self, run: ExecuteChunks, missing: float) -> None:
         run.begin_anew()  # chunks that arrived meanwhile were planned from earlier joints
@@ -369,13 +373,13 @@ class CommandPipeline:
         self._verdicts.clear()
         self._report.emit("joints_back", _JOINTS_BACK(seconds=missing))
 
-    def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
+    def _nothing_planned(self, step: int, planned: float, observation: LatestObservation) -> TickResult:
         run = self.run
         if run is None:
             return TickResult(planned)
-        unseen = self._safety.unseen(self.actuator.state(seen, planned, None))
+        unseen = self._safety.unseen(self.actuator.state(observation, planned, None))
         if unseen and not run.is_waiting:  # without joints a policy cannot answer
-            return self._refuse(step, planned, None, (unseen,), seen)
+            return self._refuse(step, planned, None, (unseen,), observation)
         self._braking_hold()
         starved = run.update_starvation(planned)
         if starved == 0.0:
@@ -383,12 +387,12 @@ class CommandPipeline:
         borne = self._settings.starvation == "slow" and planned < run.borne_until
         if starved is not None and starved >= self._settings.starvation_patience and not borne:
             self.hold_because("starvation", _STARVED(seconds=starved) if starved else _STARVED_AT_ONCE)
-        return self._send_braking(step, planned, seen)
+        return self._send_braking(step, planned, observation)
 
-    def _send_braking(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
+    def _send_braking(self, step: int, planned: float, observation: LatestObservation) -> TickResult:
         """Send the next point of a braking motion instead of a missing or refused action."""
         target = self._braking_hold().target(step, self.actuator.elapsed(planned))
-        return self._send_hold(step, planned, target, seen)._replace(target=None)
+        return self._send_hold(step, planned, target, observation)._replace(target=None)
 
     def _braking_hold(self) -> Hold:
         """Return the braking motion that replaces a missing or refused action; start one if none is active.

@@ -78,11 +78,11 @@ class Led:
         self._rests = now if self._rests is None else self._rests
         if now - self._rests < _REST_S:
             return off
-        way = commanded - self._from
+        commanded_travel = commanded - self._from
         alone = (self._speed + speed) / 2.0 * (now - self._at)
-        went = (measured - self._read) * np.sign(way)
-        goes_along = went - alone * np.sign(way) > np.abs(way) / 2.0
-        far, steady = np.abs(way) > PART / 2.0, np.abs(speed - self._speed) <= _DRIFTS
+        went = (measured - self._read) * np.sign(commanded_travel)
+        goes_along = went - alone * np.sign(commanded_travel) > np.abs(commanded_travel) / 2.0
+        far, steady = np.abs(commanded_travel) > PART / 2.0, np.abs(speed - self._speed) <= _DRIFTS
         says = ~self.whole & far & (steady | (went < -PART / 2.0))
         self.along += says & goes_along
         self._alone += says & ~goes_along

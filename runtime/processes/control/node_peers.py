@@ -88,7 +88,7 @@ class SubscriberCheck:
             return
         self._told = unheard
         if unheard:
-            said = [why or _UNHEARD(place=place) for place, why in sorted(unheard.items())]
-            self._say(NO_SUBSCRIBER, series(said), {"unheard": unheard})
+            texts = [reason or _UNHEARD(place=place) for place, reason in sorted(unheard.items())]
+            self._say(NO_SUBSCRIBER, series(texts), {"unheard": unheard})
         else:
             self._say(ALL_SUBSCRIBED, _HEARD, {"unheard": {}})

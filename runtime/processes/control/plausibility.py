@@ -216,9 +216,9 @@ class JointPlausibility:
             return False
         if self._has_swapped(chain, sample):
             return False
-        other = self._other
-        return other is None or self._min_travel_time(chain.newest, sample) <= self._min_travel_time(
-            other.newest, sample
+        rival = self._other
+        return rival is None or self._min_travel_time(chain.newest, sample) <= self._min_travel_time(
+            rival.newest, sample
         )
 
     def _min_travel_time(self, before: _Sample, after: _Sample) -> float:
@@ -227,28 +227,28 @@ class JointPlausibility:
         return float(moved.max(where=self._places, initial=0.0))
 
     def _contradiction(self, sample: _Sample) -> str:
-        other = self._other
-        if other is not None and not self._faster(other.newest, sample).any():
-            self._digits.add_step(difference(sample.joints, other.newest.joints, self._wrapping))
-            other.samples.append(sample)
+        rival = self._other
+        if rival is not None and not self._faster(rival.newest, sample).any():
+            self._digits.add_step(difference(sample.joints, rival.newest.joints, self._wrapping))
+            rival.samples.append(sample)
         else:
-            if other is not None or self._chain is not None:
+            if rival is not None or self._chain is not None:
                 self._contradict(sample.seen)
-            self._other = other = _Chain(sample, self._permanent_reason(sample))
-        if not other.never and not (stuck := self._stuck(other)) and other.recent(self._needed):
-            self.dead = "" if self._before is None else self._zeros(self._before, other.samples[0].joints)
+            self._other = rival = _Chain(sample, self._permanent_reason(sample))
+        if not rival.never and not (stuck := self._stuck(rival)) and rival.recent(self._needed):
+            self.dead = "" if self._before is None else self._zeros(self._before, rival.samples[0].joints)
             if (
                 self._chain is not None
             ):  # samples were continuous: a hand moves gradually, so a faster change is a leap
-                self.leapt |= self._faster(self._chain.newest, other.samples[0], np.inf)
-            self._chain, self._other, self._before = other, None, None
+                self.leapt |= self._faster(self._chain.newest, rival.samples[0], np.inf)
+            self._chain, self._other, self._before = rival, None, None
             return ""
-        return other.never or stuck or self._jump(sample)
+        return rival.never or stuck or self._jump(sample)
 
     def _contradict(self, now: float) -> None:
         """Require longer agreement after repeated contradictions."""
-        again = now - self._contradicted < max(_QUIET_S, 2.0 * self._needed)
-        self._needed = min(2.0 * self._needed, _LONGEST_DOUBT_S) if again else CONSISTENT_S
+        repeated = now - self._contradicted < max(_QUIET_S, 2.0 * self._needed)
+        self._needed = min(2.0 * self._needed, _LONGEST_DOUBT_S) if repeated else CONSISTENT_S
         self._contradicted = now
         if self._chain is not None:
             self._chain.forget()
@@ -307,14 +307,14 @@ class JointPlausibility:
     def _swapped_joints(self, before: _Sample, after: _Sample) -> str:
         """Return the joints that have exchanged their values, within the motion possible meanwhile."""
         away = np.abs(difference(after.joints, before.joints, self._wrapping))
-        other = np.flatnonzero(self._places & (away > _SAME))
-        apart = np.sort(before.joints[other]) - np.sort(after.joints[other])
-        moved = _SAME + self._limits.velocity[other].max(initial=0.0) * min(
+        moved_joints = np.flatnonzero(self._places & (away > _SAME))
+        apart = np.sort(before.joints[moved_joints]) - np.sort(after.joints[moved_joints])
+        moved = _SAME + self._limits.velocity[moved_joints].max(initial=0.0) * min(
             after.seen - before.seen, _LONGEST_S
         )
-        if len(other) < 2 or np.abs(apart).max() > moved:
+        if len(moved_joints) < 2 or np.abs(apart).max() > moved:
             return ""
-        return " and ".join(self._limits.names[i] for i in other)
+        return " and ".join(self._limits.names[i] for i in moved_joints)
 
     def _has_swapped(self, chain: _Chain, sample: _Sample) -> bool:
         """Return True if joints jumped to each other's values, within their velocity but beyond any acceleration."""
@@ -365,8 +365,8 @@ class JointPlausibility:
             return zeros
         before, oldest = chain.samples[-2], chain.samples[-3]
         speed = (newest.joints - before.joints) / max(newest.captured - before.captured, _EPSILON)
-        way = -newest.joints / max(sample.captured - newest.captured, _EPSILON)
-        passes = (speed * way > 0.0) & (np.abs(speed) >= 0.5 * np.abs(way))
+        drop_velocity = -newest.joints / max(sample.captured - newest.captured, _EPSILON)
+        passes = (speed * drop_velocity > 0.0) & (np.abs(speed) >= 0.5 * np.abs(drop_velocity))
         returns = (before.joints == 0.0) | (oldest.joints == 0.0)
         return self._zeros(np.where(passes | returns, 0.0, newest.joints), sample.joints)
 
@@ -378,8 +378,10 @@ class JointPlausibility:
         was = ", ".join(f"{before[i]:.3f}" for i in dead)
         return _ZERO_AFTER(joints=", ".join(self._limits.names[i] for i in dead), before=was)
 
-    def _away(self, joints: Float64, held: Float64, allowed: Float64 | float, but: np.ndarray | bool) -> bool:
-        apart = np.abs(difference(joints, held, self._wrapping))
+    def _away(
+        self, joints: Float64, reference: Float64, allowed: Float64 | float, but: np.ndarray | bool
+    ) -> bool:
+        apart = np.abs(difference(joints, reference, self._wrapping))
         return bool((self._places & np.logical_not(but) & (apart > allowed)).any())
 
 

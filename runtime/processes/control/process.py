@@ -45,15 +45,15 @@ def make_sink(spec: StationSpec, clock: Clock) -> Sink:
 
 def make_publisher(spec: StationSpec) -> PosePublisher | None:
     """Return the converter of joint commands to published poses; None if only joints are published."""
-    wanted, robot = spec.deployment.publication, spec.robot
-    if wanted.space == "joint":
+    publication, robot = spec.deployment.publication, spec.robot
+    if publication.space == "joint":
         return None
     from runtime.kinematics.base import ChainForward
     from runtime.spaces.end_effectors import EndEffectors
     from runtime.spaces.pose_rows import PosePublisher, PoseRows
 
     return PosePublisher(
-        PoseRows(wanted.pose, robot, "publication.pose"), EndEffectors(robot, ChainForward(robot))
+        PoseRows(publication.pose, robot, "publication.pose"), EndEffectors(robot, ChainForward(robot))
     )
 
 

@@ -110,11 +110,13 @@ class SteadyError:
         while now - self._samples[0].time > _WINDOW_S:
             self._samples.popleft()
         first, newest = self._samples[0], self._samples[-1]
-        told = newest.commanded - first.commanded
-        followed = told - (newest.error - first.error)
-        moved = np.abs(told) > _TOLD
-        self._presses |= moved & (followed * np.sign(told) < _FOLLOWED * np.abs(told))
-        self._presses &= ~(moved & (followed * np.sign(told) > 2.0 * _FOLLOWED * np.abs(told)))
+        commanded_travel = newest.commanded - first.commanded
+        followed = commanded_travel - (newest.error - first.error)
+        moved = np.abs(commanded_travel) > _TOLD
+        self._presses |= moved & (followed * np.sign(commanded_travel) < _FOLLOWED * np.abs(commanded_travel))
+        self._presses &= ~(
+            moved & (followed * np.sign(commanded_travel) > 2.0 * _FOLLOWED * np.abs(commanded_travel))
+        )
 
     def _error(self, robot: RobotActuator, measured: Float64) -> Float64:
         return difference(robot.commanded, measured, self._settings.dims.wrapping)
@@ -128,5 +130,7 @@ class SteadyError:
         least = np.abs([sample.error for sample in self._samples]).min(axis=0)
         rests = (np.ptp(commands, axis=0) <= _STILL) & (np.ptp(commands - errors, axis=0) <= _QUIET)
         steady = (np.abs(error) <= self._settings.safety.steady_error) & (np.abs(error) - least <= _GROWN)
-        seen = now - self._samples[0].time >= _REST_S - _EVERY_S
-        return np.asarray(self._settings.limits.position_mask & rests & steady & seen & ~self._presses), error
+        covered = now - self._samples[0].time >= _REST_S - _EVERY_S
+        return np.asarray(
+            self._settings.limits.position_mask & rests & steady & covered & ~self._presses
+        ), error

@@ -143,13 +143,13 @@ class Telemetry:
         self._note_corrected(sent)
         self.nearing.update(sent, self.planned)
         target, executed = sent.target, sent.executed
-        wanted = target is not None and target.path is not None
-        self._smoothed = target.action.astype(np.float32) if target and wanted else None
+        is_planned = target is not None and target.path is not None
+        self._smoothed = target.action.astype(np.float32) if target and is_planned else None
         makers = target.contributions if target else ()
         self._emit_contributions(makers, sent)
         if self._shared_state.unrecorded:
             return
-        done = ExecutedTick(
+        executed_tick = ExecutedTick(
             step=self._step,
             run=self.run,
             planned=self.planned,
@@ -165,7 +165,7 @@ class Telemetry:
             refused=sent.refused,
             woke=self._woke,
         )
-        self._push("ticks", done)
+        self._push("ticks", executed_tick)
 
     def publish(self, seen: LatestObservation, standing: TickState) -> None:
         """Publish control's status, and only then its events.

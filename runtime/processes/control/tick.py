@@ -178,8 +178,8 @@ class Tick:
         if self._shared_state.estop is not EStop.UNKNOWN:
             sent = self._robot.tick(step, planned, self._seen)
             if self._simulated is not None:
-                shown = self._simulated.tick(step, planned, self._seen)
-                sent = shown._replace(notes=(*sent.notes, *shown.notes), corrected=sent.corrected)
+                simulated = self._simulated.tick(step, planned, self._seen)
+                sent = simulated._replace(notes=(*sent.notes, *simulated.notes), corrected=sent.corrected)
         return sent
 
     def _standing(self, step: int, sent: TickResult) -> TickState:
@@ -316,8 +316,8 @@ class Tick:
         if self._simulated is None:
             measured = self._measured(now)
             if measured is None:
-                why = self._seen.implausible_reason or _NO_FRESH_JOINTS
-                self._report.emit("unmeasured", _SIMULATION_UNPLACED(why=why))
+                reason = self._seen.implausible_reason or _NO_FRESH_JOINTS
+                self._report.emit("unmeasured", _SIMULATION_UNPLACED(why=reason))
                 return
             start = SimulatedActuator(measured, self._settings, self._clock)
             self._simulated, self._simulated_run = self._make_pipeline(start), order.run
@@ -334,10 +334,10 @@ class Tick:
         if not self._actuator.engaged:
             measured = self._measured(now)
             if measured is None or not self._plausibility.is_settled:
-                why = self._seen.implausible_reason or (
+                reason = self._seen.implausible_reason or (
                     _NO_FRESH_JOINTS if measured is None else _CONTRADICTION
                 )
-                self._report.emit("unmeasured", _ROBOT_UNSEEN(why=why))
+                self._report.emit("unmeasured", _ROBOT_UNSEEN(why=reason))
                 return False
             self._plausibility.reset_zeros()
             self._actuator.engage(measured)
@@ -379,12 +379,12 @@ class Tick:
         If the e-stop is pressed in a gap of the measurements, the last joints are older: the arm has moved on, and
         would be driven back to them.
         """
-        seen = self._seen.joints_captured
+        captured = self._seen.joints_captured
         return (
             stopped.was_measured
             or not self._actuator.engaged
-            or seen > stopped.captured
-            or now - seen <= _NOW_S
+            or captured > stopped.captured
+            or now - captured <= _NOW_S
         )
 
     def _stop_at(self, measured: Float64, stopped: EStopHold, now: float) -> None:
@@ -449,8 +449,8 @@ class Tick:
         """Hold at the robot's measured position, if it is too far from the commanded position."""
         behaviour = self._robot.behaviour
         stopped = isinstance(behaviour, EStopHold)
-        held = (self._robot.is_stationary or stopped) and self._actuator.engaged
-        where = self._displacement(self._actuator, self._seen, now, held, stopped)
+        stationary = (self._robot.is_stationary or stopped) and self._actuator.engaged
+        where = self._displacement(self._actuator, self._seen, now, stationary, stopped)
         self._report_untrusted_joints()
         if where is None:
             return
@@ -476,13 +476,13 @@ class Tick:
         elif doubt:
             self._report.emit("implausible", doubt)
 
-    def _disengage(self, why: str) -> None:
-        """Stop sending commands, and emit `why`.
+    def _disengage(self, reason: str) -> None:
+        """Stop sending commands, and emit `reason`.
 
         An old target would pull a node that restarted at 0, a new target would pull a joint with a dead encoder.
         """
         self._left_run = self._report.run
-        self._report_displaced(why)
+        self._report_displaced(reason)
         if isinstance(self._robot.behaviour, EStopHold):
             self._robot.behaviour.release()
             self._actuator.disengage()

@@ -28,12 +28,12 @@ def make_leader(spec: StationSpec, clock: Clock) -> Leader:
     Raises:
         ConfigurationError: the deployment has no leader.
     """
-    wanted = spec.deployment.collection
-    if wanted is None or wanted.leader is None:
+    collection = spec.deployment.collection
+    if collection is None or collection.leader is None:
         raise ConfigurationError("this deployment has no [collection.leader]")
-    kind = variants("runtime.teleoperators")[wanted.leader.kind]
-    made: Leader = kind.build(wanted.leader, spec.robot, clock)
-    return made
+    kind = variants("runtime.teleoperators")[collection.leader.kind]
+    leader: Leader = kind.build(collection.leader, spec.robot, clock)
+    return leader
 
 
 def make_policy(
@@ -72,16 +72,16 @@ def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpe
     """Return the policy that is queried while the operator drives the robot."""
     from runtime.teleoperators.leader_policy import LeaderPolicy, NodeDrivenPolicy
 
-    wanted = spec.deployment.collection
-    if wanted is None:
+    collection = spec.deployment.collection
+    if collection is None:
         raise ConfigurationError("this deployment has no [collection]: there is no leader")
-    if wanted.source == "node":
+    if collection.source == "node":
         return NodeDrivenPolicy()
     return LeaderPolicy(
         leader(spec, clock),
         spec.robot,
-        wanted.mode,
-        wanted.max_age_s,
+        collection.mode,
+        collection.max_age_s,
         spec.rate,
         clock,
         spec.deployment.safety.steady_error,
@@ -91,8 +91,8 @@ def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpe
 def make_kinematics(spec: StationSpec) -> Kinematics:
     """Return forward and inverse kinematics of the robot, completely compiled and loaded."""
     settings = spec.deployment.kinematics
-    made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, spec.robot)
-    return made
+    kinematics: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, spec.robot)
+    return kinematics
 
 
 def kinematics_compiled(spec: StationSpec) -> bool:

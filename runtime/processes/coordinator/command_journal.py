@@ -55,7 +55,7 @@ class CommandJournal:
         """
         if not answered:
             return ""
-        lines = [json.dumps(_row(*one), default=str).encode() + b"\n" for one in answered]
+        lines = [json.dumps(_row(*answer), default=str).encode() + b"\n" for answer in answered]
         try:
             append_durably(self._file, b"".join(lines), os.fdatasync)
         except OSError as error:

@@ -113,8 +113,8 @@ class Coordinator(Components):
         before, run = self.session.state, self.runs.open
         if self.session.handle_event(happening, reason):
             text = _CHANGED(before=before, after=self.session.state, reason=reason)
-            state, told = str(self.session.state), self.session.state_meaning()
-            data = {"state": state, "state_is": told, **self._unbegun(run)}
+            state, meaning = str(self.session.state), self.session.state_meaning()
+            data = {"state": state, "state_is": meaning, **self._unbegun(run)}
             self.emit(Event("state", text, self.clock.now(), data=data))
 
     def _unbegun(self, run: Run | None) -> dict[str, Any]:
@@ -138,7 +138,7 @@ class Coordinator(Components):
             return
         stage = self.setup.stage
         try:
-            done = self.setup.poll()
+            complete = self.setup.poll()
         except RuntimeFault as error:
             self.setup.fail()
             self.orders.send_order("hold")
@@ -146,7 +146,7 @@ class Coordinator(Components):
             return
         if self.setup.stage is not stage:
             self.emit(Event("setup", self.setup.stage.sentence, self.clock.now()))
-        if done:
+        if complete:
             self.handle_event(SessionEvent.SETUP_DONE, self.setup.outcome)
 
     def _advance_inference(self) -> None:
@@ -191,23 +191,25 @@ class Coordinator(Components):
         if ack.status == "accepted" and command.kind in ("setup", "run"):
             self.preflights.cancel(_WANTED(command=command.kind, who=display_name(command)))
         # Renewals of a lease are a stream; only its changes and refusals are worth an event.
-        kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
-        if not kept:
+        lease_renewed = (
+            command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
+        )
+        if not lease_renewed:
             self.collecting.record_activity()
-            who = {"command": command.kind, "who": display_name(command), "status": ack.status}
-            what = _ANSWERED_WITH(**who, reason=ack.reason) if ack.reason else _ANSWERED(**who)
-            told = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
-            told |= {"user": command.user, "role": command.role, "holder": command.holder}
-            self.emit(Event("command", what, self.clock.now(), data=told | self._unbegun(run)))
+            fields = {"command": command.kind, "who": display_name(command), "status": ack.status}
+            text = _ANSWERED_WITH(**fields, reason=ack.reason) if ack.reason else _ANSWERED(**fields)
+            data = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
+            data |= {"user": command.user, "role": command.role, "holder": command.holder}
+            self.emit(Event("command", text, self.clock.now(), data=data | self._unbegun(run)))
         return ack
 
     def _press_estop(self, command: Command) -> Ack:
         """Set the e-stop flag in any state, for any sender; the guard latches it, at once or when it is restarted."""
         self.shared.rings["presses"].push(encode(command))
         self.shared.set_estop(EStop.LATCHED)
-        told = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
+        data = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
         text = _PRESSED(who=display_name(command), why=reason_of(command))
-        self.emit(Event("command", text, self.clock.now(), data=told))
+        self.emit(Event("command", text, self.clock.now(), data=data))
         return Ack(command.uuid, "accepted", _ESTOP_FLAG_RAISED, boot=self.boot, kind=command.kind)
 
     def _permission_problem(self, command: Command) -> str:

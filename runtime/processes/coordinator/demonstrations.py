@@ -189,9 +189,9 @@ class Demonstrations:
             return self._node_silence(run, state)
         if self.armed and now - self._touched > IDLE_S:
             self.disarm(_NOBODY_DID_ANYTHING(minutes=IDLE_S / 60))
-        if self.armed and (why := self.leader_problem):
-            self.disarm(why)
-            self._event("leader_lost", why)
+        if self.armed and (problem := self.leader_problem):
+            self.disarm(problem)
+            self._event("leader_lost", problem)
         return None
 
     def _update_first_goal(self) -> None:
@@ -223,9 +223,9 @@ class Demonstrations:
         if silent <= NODE_SILENT_S:
             return None
         never = self._reported_at is None or self._reported_at < run.begun_at
-        why = _NODE_NEVER_REPORTED(seconds=NODE_SILENT_S) if never else _NODE_SILENT(seconds=silent)
-        self._event("node_silent", why)
-        return (SessionEvent.RUN_FAILED if never else SessionEvent.HELD), why
+        reason = _NODE_NEVER_REPORTED(seconds=NODE_SILENT_S) if never else _NODE_SILENT(seconds=silent)
+        self._event("node_silent", reason)
+        return (SessionEvent.RUN_FAILED if never else SessionEvent.HELD), reason
 
     # --- episodes --------------------------------------------------------------------------------------------
 
@@ -295,25 +295,25 @@ class Demonstrations:
         self._say(Event("labelled", _LABELLED(episode=episode, how=how), self._clock.now(), data=data))
         return data
 
-    def _find_episode(self, given: str | None) -> tuple[str, Label]:
-        """Return the uuid of the episode `given` (None: the open or the newest one), and its latest label.
+    def _find_episode(self, requested: str | None) -> tuple[str, Label]:
+        """Return the uuid of the episode `requested` (None: the open or the newest one), and its latest label.
 
         Raises:
-            RuntimeFault: the episode is no demonstration of this station, or `given` names the open episode.
+            RuntimeFault: the episode is no demonstration of this station, or `requested` names the open episode.
         """
         run = self.run
-        if given is None:
+        if requested is None:
             episode = run.uuid if run is not None else self._newest
             if run is None and self._opened() is not None:
                 raise RuntimeFault(_OPEN_RUN_NO_DEMONSTRATION)
             if not episode:
                 raise RuntimeFault(_NONE_COLLECTED)
         else:
-            episode = given
-            if run is not None and run.uuid == given:
-                raise RuntimeFault(_EPISODE_OPEN(episode=given))
-            if given not in self._asked:
-                self._require_demonstration(given)
+            episode = requested
+            if run is not None and run.uuid == requested:
+                raise RuntimeFault(_EPISODE_OPEN(episode=requested))
+            if requested not in self._asked:
+                self._require_demonstration(requested)
         before = latest_label(self._data, episode)
         return episode, before or Label(0.0, "")
 
@@ -400,8 +400,8 @@ class Demonstrations:
         alive = age is not None and age <= NODE_SILENT_S
         times = self._reported
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9) if alive and len(times) > 1 else 0.0
-        asked = run is not None and run.begun_at is not None
-        state = "alive" if alive else "silent" if asked else "unknown"
+        begun = run is not None and run.begun_at is not None
+        state = "alive" if alive else "silent" if begun else "unknown"
         return {"kind": "node", "rate": rate, "age_s": age, "state": state}
 
     def _event(self, kind: str, text: str) -> None:

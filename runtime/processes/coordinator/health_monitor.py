@@ -199,20 +199,20 @@ class HealthMonitor:
         return now - self._pressed < _LATCH_S
 
     def _leases(self, going: Run | None) -> Iterator[HealthEvent]:
-        held = self._lease.current(self._people.now()) is not None
-        if self._lease_held and not held:
+        is_held = self._lease.current(self._people.now()) is not None
+        if self._lease_held and not is_held:
             limit = self._goes_on_to(going)
             self._unattended = limit is not None
             if limit is None:
                 yield HealthEvent(SessionEvent.LEASE_ENDED, _LEASE_ENDED)
             else:
                 yield HealthEvent(SessionEvent.HOLDER_LOST, _GOES_ON(seconds=limit))
-        elif held or going is None:
+        elif is_held or going is None:
             self._unattended = False
         elif self._unattended and not self._stoppable():
             self._unattended = False
             yield HealthEvent(SessionEvent.LEASE_ENDED, _PANEL_GONE)
-        self._lease_held = held
+        self._lease_held = is_held
 
     def _goes_on_to(self, going: Run | None) -> float | None:
         """Return the duration [s] to which the run continues although its lease holder is lost.
@@ -235,8 +235,8 @@ class HealthMonitor:
             yield HealthEvent(SessionEvent.CONNECTED, _CONNECTED)
         elif age < _CONNECTED_S:
             silent = _NO_PICTURE(cameras=", ".join(missing))
-            why = series([silent, *describe_camera_problems(self._reception().cameras, missing)])
-            yield HealthEvent(SessionEvent.INCOMPLETE, why)
+            reason = series([silent, *describe_camera_problems(self._reception().cameras, missing)])
+            yield HealthEvent(SessionEvent.INCOMPLETE, reason)
         elif age > _LINK_LOST_S and not record["last"]:
             yield HealthEvent(SessionEvent.LINK_LOST, _LINK_LOST(seconds=age, who=self._who_is_silent()))
 

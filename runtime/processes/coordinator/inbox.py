@@ -91,8 +91,8 @@ class Inbox:
         if event.kind == "starvation":
             trouble = to.inference.problem
             stops = settings.faults.starvation == "stop"
-            why = _STARVED_BECAUSE(why=event.text, trouble=trouble) if trouble else event.text
-            to.handle_event(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, why)
+            reason = _STARVED_BECAUSE(why=event.text, trouble=trouble) if trouble else event.text
+            to.handle_event(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, reason)
         elif event.kind in _HOLDS or (
             event.kind == "recording_failed" and settings.recording.on_failure == "hold"
         ):

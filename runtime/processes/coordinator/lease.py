@@ -49,10 +49,10 @@ class Lease:
 
     def status(self, now: float) -> dict[str, Any]:
         """Return holder, name, epoch and remaining seconds; without a lease the newest epoch and no holder."""
-        held = self.current(now)
-        if held is None:
+        lease = self.current(now)
+        if lease is None:
             return {"holder": "", "by": "", "epoch": self._epoch, "expires_in": 0.0}
-        return {"holder": held.holder, "by": held.by, "epoch": held.epoch, "expires_in": held.until - now}
+        return {"holder": lease.holder, "by": lease.by, "epoch": lease.epoch, "expires_in": lease.until - now}
 
     def lost(self, now: float) -> bool:
         """Return True if the newest lease expired unintentionally: neither released nor with a hidden page."""
@@ -75,13 +75,13 @@ class Lease:
             return _NEEDS_A_HOLDER
         if not 0 <= epoch <= HIGHEST_EPOCH:
             return _EPOCH_IMPOSSIBLE(epoch=epoch, highest=HIGHEST_EPOCH)
-        held = self.current(now)
-        if held and held.holder == holder and epoch in (0, held.epoch):
-            self._held = replace(held, until=now + self._ttl, hidden=False)
+        lease = self.current(now)
+        if lease and lease.holder == holder and epoch in (0, lease.epoch):
+            self._held = replace(lease, until=now + self._ttl, hidden=False)
             return ""
         if epoch == 0:
-            if held:
-                return _HELD_FOR_ANOTHER(holder=held.holder, seconds=held.until - now)
+            if lease:
+                return _HELD_FOR_ANOTHER(holder=lease.holder, seconds=lease.until - now)
             epoch = self._epoch + 1
         # An epoch that was used before can never be granted again, so that a delayed claim does not take the
         # lease back.
@@ -112,11 +112,11 @@ class Lease:
 
     def check(self, holder: str, epoch: int, now: float) -> str:
         """Return "" if this holder may command at `now`, else the reason."""
-        held = self.current(now)
-        if held is None:
+        lease = self.current(now)
+        if lease is None:
             return _NOBODY_HOLDS
-        if held.holder != holder:
-            return _HELD_BY(holder=held.holder)
-        if held.epoch != epoch:
-            return _OTHER_EPOCH(epoch=epoch, newest=held.epoch)
+        if lease.holder != holder:
+            return _HELD_BY(holder=lease.holder)
+        if lease.epoch != epoch:
+            return _OTHER_EPOCH(epoch=epoch, newest=lease.epoch)
         return ""

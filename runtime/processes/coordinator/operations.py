@@ -155,8 +155,8 @@ class SessionActions:
     def begin_setup(self, asked: SetUpRequest) -> TransitionResult:
         spec, reset = self._changed_spec(asked), self.setup.bench.from_request(asked.bench)
         policy = self.inference.policy
-        other = spec.deployment.policy != self.spec.deployment.policy
-        if spec.collecting != self.spec.collecting or (other and not spec.collecting):
+        policy_changed = spec.deployment.policy != self.spec.deployment.policy
+        if spec.collecting != self.spec.collecting or (policy_changed and not spec.collecting):
             policy = self._make_policy(spec, self.clock)
         self._orders.tune(spec.deployment.strategy.model_dump())
         self.manual.unlock()
@@ -171,35 +171,37 @@ class SessionActions:
         self.setup.begin(reset, asked.least)
         return {"bench": reset["id"]} if reset else {}
 
-    def _changed_spec(self, asked: SetUpRequest) -> StationSpec:
+    def _changed_spec(self, request: SetUpRequest) -> StationSpec:
         """Return the deployment's specification with the changes of a set-up request.
 
         Raises:
             RuntimeFault: the result is invalid, or contradicts the manifest of an open recording.
         """
-        collects = self._collects(asked)
-        changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
+        collects = self._collects(request)
+        changes = request.changes | ({"strategy": {"kind": "naive"}} if collects else {})
         resolved = loader.apply_changes(self._own.resolved, changes, "setup")
         if self.runs.is_recording_standalone and resolved.digest != self.spec.resolved.digest:
             raise RuntimeFault(_RECORDING_OPEN_OF_OTHER_MANIFEST)
         return replace(self._own, resolved=resolved, collecting=collects)
 
-    def _collects(self, asked: SetUpRequest) -> bool:
+    def _collects(self, request: SetUpRequest) -> bool:
         """Return True if the operator drives the robot after this set-up.
 
         Raises:
             RuntimeFault: the request contradicts the deployment.
         """
         settings = self._own.deployment
-        absent = settings.policy.kind == "none" and asked.policy is None
-        collects = absent if asked.collect is None else asked.collect
+        absent = settings.policy.kind == "none" and request.policy is None
+        collects = absent if request.collect is None else request.collect
         if collects and settings.collection is None:
             raise RuntimeFault(_COLLECT_WITHOUT_COLLECTION)
         if not collects and absent:
             raise RuntimeFault(_NO_COLLECT_WITHOUT_POLICY)
-        given = [name for name in ("policy", "strategy", "checkpoint") if getattr(asked, name) is not None]
-        if collects and given:
-            raise RuntimeFault(_GIVEN_WITH_COLLECT(given=", ".join(given)))
+        unsuitable = [
+            name for name in ("policy", "strategy", "checkpoint") if getattr(request, name) is not None
+        ]
+        if collects and unsuitable:
+            raise RuntimeFault(_GIVEN_WITH_COLLECT(given=", ".join(unsuitable)))
         return collects
 
     def cancel_setup(self, reason: str) -> None:
@@ -226,29 +228,29 @@ class SessionActions:
         collecting.on_episode_started(episode, asked)
         return {"episode": episode}
 
-    def _mode(self, asked: RunRequest) -> Mode:
+    def _mode(self, request: RunRequest) -> Mode:
         """Return the mode of a run.
 
         Raises:
             RuntimeFault: the station is not set up for it.
         """
         collects, settings = self.spec.collecting, self.spec.deployment
-        mode = asked.mode or ("collect" if collects else settings.run.mode)
+        mode = request.mode or ("collect" if collects else settings.run.mode)
         if collects and mode not in ("collect", "manual"):
             raise RuntimeFault(_MODE_WHILE_COLLECTING(mode=mode))
         if mode == "collect" and not collects:
             raise RuntimeFault(_UNCOLLECTING if settings.collection is None else _NOT_SET_UP_TO_COLLECT)
-        given = [name for name in ("task", "session") if getattr(asked, name) is not None]
-        if given and mode != "collect":
-            raise RuntimeFault(_GIVEN_WITHOUT_COLLECT(given=", ".join(given), mode=mode))
+        unsuitable = [name for name in ("task", "session") if getattr(request, name) is not None]
+        if unsuitable and mode != "collect":
+            raise RuntimeFault(_GIVEN_WITHOUT_COLLECT(given=", ".join(unsuitable), mode=mode))
         return mode
 
-    def _require_comparable(self, asked: RunRequest) -> None:
+    def _require_comparable(self, request: RunRequest) -> None:
         """Raise RuntimeFault if a trial would not be executed exactly as set up.
 
         This is the case in a mode other than "continuous", after tuning, with a locked gripper, or without recording.
         """
-        mode = self._mode(asked)
+        mode = self._mode(request)
         if mode != "continuous":
             raise RuntimeFault(_TRIAL_MODE(mode=mode))
         if not self.spec.deployment.recording.enabled:
@@ -314,9 +316,9 @@ class SessionActions:
 
         It is that of the last set-up, or during a run that of the proposal.
         """
-        made, first = self.inference.proposal, self.setup.first_action
-        if self._state() is not SessionState.READY and made is not None:
-            self.runs.approach(self.manual.check_motion("approach", made.commands.intended_start))
+        proposal, first = self.inference.proposal, self.setup.first_action
+        if self._state() is not SessionState.READY and proposal is not None:
+            self.runs.approach(self.manual.check_motion("approach", proposal.commands.intended_start))
         elif first is not None:
             self.setup.begin_approach(self.manual.check_motion("approach", first))
 
@@ -332,10 +334,10 @@ class SessionActions:
 
         If the request names none, it is the open episode, which ends as by `end_run`, or the newest one.
         """
-        told = self.collecting.discard(asked, self.by)
+        result = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:
             self.end_run("finished", DISCARDED)
-        return told
+        return result
 
     # --- hold, end, home, record --------------------------------------------------------------------
 

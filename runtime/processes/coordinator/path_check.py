@@ -41,13 +41,13 @@ class PathCheck:
 
         `what` begins the message. A box is left only by a path that was inside it.
         """
-        way = self._path(start, goal)
-        if arm := self._workspace.arm_leaving_on(way):
+        path = self._path(start, goal)
+        if arm := self._workspace.arm_leaving_on(path):
             raise RuntimeFault(_LEAVES_WORKSPACE(what=what, arm=arm))
-        found = self._collisions.first_on_path(way)
-        if found is not None:
-            collision, at = found
-            raise RuntimeFault(_COLLIDES(what=what, collision=collision, percent=100 * at / (len(way) - 1)))
+        match = self._collisions.first_on_path(path)
+        if match is not None:
+            collision, at = match
+            raise RuntimeFault(_COLLIDES(what=what, collision=collision, percent=100 * at / (len(path) - 1)))
 
     def _path(self, start: Float64, goal: Float64) -> Float64:
         """Return postures [T, D] from `start` to `goal` at most _STEP apart."""

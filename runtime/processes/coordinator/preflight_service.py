@@ -83,13 +83,13 @@ class PreflightService:
         self._preflights.close()
 
     def _start(self, command: Command) -> dict[str, Any]:
-        asked = read("preflight", PreflightRequest, command.args)
-        self._require_free(asked)
-        longest = self._preflights.start(asked, self._own.resolved)
-        self._emit(_BEGUN(about=asked.about, who=display_name(command)), {"id": asked.id})
-        return {"id": asked.id, "longest_s": longest}
+        request = read("preflight", PreflightRequest, command.args)
+        self._require_free(request)
+        longest = self._preflights.start(request, self._own.resolved)
+        self._emit(_BEGUN(about=request.about, who=display_name(command)), {"id": request.id})
+        return {"id": request.id, "longest_s": longest}
 
-    def _require_free(self, asked: PreflightRequest) -> None:
+    def _require_free(self, request: PreflightRequest) -> None:
         """Raise RuntimeFault if the station is at work.
 
         Also if it is ready, and the preflight would take its exclusive policy server away.
@@ -99,12 +99,14 @@ class PreflightService:
             raise RuntimeFault(
                 _AT_WORK(
                     state=state,
-                    allowed=", ".join(other for other in SessionState if not other.meaning.at_work),
+                    allowed=", ".join(
+                        free_state for free_state in SessionState if not free_state.meaning.at_work
+                    ),
                 )
             )
         if not state.meaning.ready:
             return
-        settings = apply_changes(self._own.resolved, asked.changes, "preflight").deployment
+        settings = apply_changes(self._own.resolved, request.changes, "preflight").deployment
         exclusive = getattr(variants("runtime.policies")[settings.policy.kind], "EXCLUSIVE", False)
         if exclusive and server_address(settings) == server_address(self._in_force().deployment):
             raise RuntimeFault(_SERVER_IN_USE(kind=settings.policy.kind))
@@ -117,10 +119,12 @@ class PreflightService:
 
         It is the server of the policy in force, or of the policy in the query, as a preflight with it would use.
         """
-        asked = read("policy_server", PolicyServerRequest, command.args)
+        request = read("policy_server", PolicyServerRequest, command.args)
         settings = self._in_force().deployment
-        if asked.policy is not None:
-            settings = apply_changes(self._own.resolved, {"policy": asked.policy}, "policy_server").deployment
+        if request.policy is not None:
+            settings = apply_changes(
+                self._own.resolved, {"policy": request.policy}, "policy_server"
+            ).deployment
         return {
             "server": server_address(settings),
             "state": str(self._state()),

@@ -101,20 +101,20 @@ class CommandService:
             self._poller.poll(math.ceil(timeout * 1000))
         if self._bell is not None:
             self._bell.hush()
-        stops, others = self._turns.take_turn()
+        stops, commands = self._turns.take_turn()
         stopped = self._stop([(call, self._identified(call, command)) for call, command in stops])
         loading, self._waiting = self._waiting, []
-        answered = self._execute(
-            [*loading, *((call, self._identified(call, command)) for call, command in others)]
+        executed = self._execute(
+            [*loading, *((call, self._identified(call, command)) for call, command in commands)]
         )
         journalled = [
-            (command, ack) for command, ack, _ in (*stopped, *answered) if command.kind not in _NOT_JOURNALLED
+            (command, ack) for command, ack, _ in (*stopped, *executed) if command.kind not in _NOT_JOURNALLED
         ]
         # Answers are journalled before they are sent, so that a repeated command is never executed twice after
         # a restart. Stops were answered already: they must not wait for the disk.
         if journalled:
             self._report_disk_failure(self._journal.append_all(journalled))
-        for _, ack, call in answered:
+        for _, ack, call in executed:
             self._server.answer(call, ack)
         self._report_flood()
         self._publish()
@@ -139,18 +139,18 @@ class CommandService:
         fresh: list[Answered] = []
         for call, command in stops:
             same = (command.kind, command.user, command.holder, command.epoch)
-            known = None if command.kind == "estop" else self._coordinator.session.answered(command)
-            ack = known or first.get(same)
+            earlier = None if command.kind == "estop" else self._coordinator.session.answered(command)
+            ack = earlier or first.get(same)
             if ack is None:
                 ack = first[same] = self._coordinator.handle(command)
                 fresh.append((command, ack, call))
             self._server.answer(call, replace(ack, uuid=command.uuid))
         return fresh
 
-    def _execute(self, asked: list[QueuedCommand]) -> list[Answered]:
+    def _execute(self, calls: list[QueuedCommand]) -> list[Answered]:
         """Execute commands; return the new answers, which are sent after they have been written to the disk."""
         fresh: list[Answered] = []
-        for call, command in asked:
+        for call, command in calls:
             if (first := self._coordinator.session.answered(command)) is not None:
                 self._server.answer(call, first)
             elif refusal := unverified_reason(command) or missing_role(command):
@@ -220,25 +220,25 @@ class CommandService:
         """Publish the newest chunk when it changes, and once a second for late subscribers."""
         if not self._streams.has_subscriber("chunk"):
             return
-        shown = self._coordinator.inference.shown
-        if shown is not self._shown or (shown is not None and now >= self._due.get("chunk", 0.0)):
-            self._shown = shown
+        displayed = self._coordinator.inference.shown
+        if displayed is not self._shown or (displayed is not None and now >= self._due.get("chunk", 0.0)):
+            self._shown = displayed
             self._due["chunk"] = now + 1.0
-            self._streams.publish("chunk", {"chunk": 0} if shown is None else self._chunk(shown))
+            self._streams.publish("chunk", {"chunk": 0} if displayed is None else self._chunk(displayed))
 
-    def _chunk(self, shown: DisplayedChunk) -> dict[str, Any]:
+    def _chunk(self, displayed: DisplayedChunk) -> dict[str, Any]:
         """Return rows float32 [H, D], poses float32 [H, 8 * arms], and the step of each row (-1: none)."""
         return {
-            "chunk": shown.number,
-            "run": shown.run,
-            "state": shown.state,
-            "observation_step": shown.observation_step,
+            "chunk": displayed.number,
+            "run": displayed.run,
+            "state": displayed.state,
+            "observation_step": displayed.observation_step,
             "step": int(self._coordinator.shared.control.read()["step"]),
-            "targets": shown.targets,
-            "rows": shown.rows.astype(np.float32),
-            "poses": self._coordinator.spaces.eef_of(shown.rows),
-            "overlap": shown.overlap,
-            "ik": dict(shown.ik),
+            "targets": displayed.targets,
+            "rows": displayed.rows.astype(np.float32),
+            "poses": self._coordinator.spaces.eef_of(displayed.rows),
+            "overlap": displayed.overlap,
+            "ik": dict(displayed.ik),
         }
 
     def _joints(self) -> dict[str, Any]:
@@ -249,13 +249,16 @@ class CommandService:
         in the step (-1: none), `chunks` is the number of contributing chunks, `limited` whether safety has changed the
         action.
         """
-        status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
+        status, observation = (
+            self._coordinator.shared.control.read(),
+            self._coordinator.shared.observation.read(),
+        )
         step = int(status["step"])
         raw, ticked = self._coordinator.inference.raw_action(step), bool(status["behaviour"])
-        nothing = np.full(len(seen["qpos"]), np.nan, np.float32)
+        nothing = np.full(len(observation["qpos"]), np.nan, np.float32)
         return {
             "step": step,
-            "measured": seen["qpos"].copy(),
+            "measured": observation["qpos"].copy(),
             "raw": nothing if raw is None else raw.astype(np.float32),
             "planned": status["smoothed"].copy() if ticked else nothing,
             "commanded": status["commanded"].copy(),
@@ -268,8 +271,11 @@ class CommandService:
 
     def _poses(self) -> np.ndarray:
         """Return end effector vectors float32 [2, 8 * arms]: measured, commanded (NaN if not engaged)."""
-        status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
-        poses = self._coordinator.spaces.eef_of(np.stack([seen["qpos"], status["commanded"]]))
+        status, observation = (
+            self._coordinator.shared.control.read(),
+            self._coordinator.shared.observation.read(),
+        )
+        poses = self._coordinator.spaces.eef_of(np.stack([observation["qpos"], status["commanded"]]))
         if not status["engaged"]:
             poses[1] = np.nan
         return poses
@@ -286,10 +292,10 @@ def main() -> None:
     member = join_station("coordinator")
     deciding = assemble(member.spec, member.shared, MonotonicClock(), ThreadRunner())
     service = CommandService(deciding, zmq.Context.instance())
-    rest = rest_s(member.spec.deployment.control.heartbeat_timeout_s)
+    wait_s = rest_s(member.spec.deployment.control.heartbeat_timeout_s)
     while not member.lifeline.is_cut:
         deciding.poll()
-        service.serve(min(rest, service.until_due()) if deciding.rests else _WORK_S)
+        service.serve(min(wait_s, service.until_due()) if deciding.rests else _WORK_S)
     deciding.close()
     service.close()
 

@@ -361,8 +361,8 @@ class Runs:
             "error": message.error,
             "waits": message.waits,
         }
-        told = {"episode": message.uuid, "rows": message.rows, "reason": message.reason}
-        text = _EPISODE_WAITS(**told) if message.waits else _EPISODE_CLOSED(**told, how=message.status)
+        fields = {"episode": message.uuid, "rows": message.rows, "reason": message.reason}
+        text = _EPISODE_WAITS(**fields) if message.waits else _EPISODE_CLOSED(**fields, how=message.status)
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
     def record_event(self, message: Message) -> None:

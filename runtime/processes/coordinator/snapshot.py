@@ -22,9 +22,9 @@ def build_snapshot(of: Components, inbox: Inbox) -> dict[str, Any]:
     "clock" is the clock of command validity; in lockstep it continues while the runtime's clock is stopped.
     "sentences" has id and arguments of texts that have them, by path: "reason", "guarded.run".
     """
-    told = _snapshot(of, inbox)
-    changing = {key: value for key, value in told.items() if key != "facts"}
-    return told | {"sentences": within(changing)}
+    snapshot = _snapshot(of, inbox)
+    changing = {key: value for key, value in snapshot.items() if key != "facts"}
+    return snapshot | {"sentences": within(changing)}
 
 
 def _snapshot(of: Components, inbox: Inbox) -> dict[str, Any]:
@@ -122,8 +122,12 @@ def _phase(of: Components) -> str:
 
 def _proposal(of: Components, now: float) -> dict[str, Any]:
     """Return the status of the chunk that waits to be committed, {} if there is none."""
-    made = of.inference.proposal
-    return {} if made is None else {**made.status(now), **of.setup.distance_of(made.commands.intended_start)}
+    proposal = of.inference.proposal
+    return (
+        {}
+        if proposal is None
+        else {**proposal.status(now), **of.setup.distance_of(proposal.commands.intended_start)}
+    )
 
 
 def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
@@ -151,13 +155,13 @@ def _link(of: Components, inbox: Inbox, now: float) -> dict[str, Any]:
     never = int(record["sequence"]) == 0
     ages = {"joints": math.inf if never else now - float(record["joints_captured"])}
     for index, camera in enumerate(of.shared.layout.cameras):
-        seen = bool(record["picture_number"][index])
-        ages[camera] = now - float(record["picture_captured"][index]) if seen else math.inf
+        received = bool(record["picture_number"][index])
+        ages[camera] = now - float(record["picture_captured"][index]) if received else math.inf
     return {
         "ages": ages,
         "rates": dict(reception.rates),
         "faults": dict(reception.faults),
-        "cameras": {key: dict(told) for key, told in reception.cameras.items()},
+        "cameras": {key: dict(status) for key, status in reception.cameras.items()},
         "unheard": dict(inbox.unheard),
         "age_ms": dict(reception.age_ms),
         "scheduling": reception.scheduling,

@@ -36,8 +36,8 @@ class TimingReport:
         scheduling = bytes(status["scheduling"]).decode()
         if not scheduling or int(status["ticks"]) < _MEASURED_S * self._rate:
             return []
-        told = [*self._judge_class(scheduling), *self._judge(float(status["lateness_p99"]))]
-        return [Event(kind, text, now) for kind, text in told]
+        problems = [*self._judge_class(scheduling), *self._judge(float(status["lateness_p99"]))]
+        return [Event(kind, text, now) for kind, text in problems]
 
     def _judge_class(self, scheduling: str) -> list[tuple[str, str]]:
         if scheduling == self._class:

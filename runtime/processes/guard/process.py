@@ -187,14 +187,14 @@ class EStopServer:
             self._poller.poll(int(timeout * 1000))
         if self._bell is not None:
             self._bell.hush()
-        presses, others = self._turns.take_turn()
+        presses, commands = self._turns.take_turn()
         anew = self._shared_state.estop is not EStop.LATCHED
         if anew:
             self._answered.clear()
         if presses:  # first the flag for all of them, then authentication, the latch and answers
             self._guard.raise_flag()
             self._answer(presses, "anew" if anew else "already")
-        for call, command in others:
+        for call, command in commands:
             self._server.answer(call, self._guard.answer(command))
         if self._server.rebind_if_unreachable() or self._endpoints.is_missing("guard"):
             self._write_endpoints()
@@ -205,8 +205,8 @@ class EStopServer:
             answer = self._answered.get(command.uuid)
             if answer is None:
                 fresh = fresh or self._guard.answer(self._identified(call, command))
-                said = {**fresh.data, "latched": latched, "carried_out_at": at}
-                answer, latched = replace(fresh, uuid=command.uuid, data=said), "already"
+                data = {**fresh.data, "latched": latched, "carried_out_at": at}
+                answer, latched = replace(fresh, uuid=command.uuid, data=data), "already"
             self._server.answer(call, answer)
             if answer.status == "done":
                 self._remember(answer)
@@ -245,23 +245,23 @@ def _arguments() -> argparse.Namespace:
 def main() -> None:
     """Guard the station until the supervisor has ended and control has stopped ticking."""
     descriptors.raise_file_limit()
-    given = _arguments()
+    arguments = _arguments()
     logs.configure_logging("guard")
     # before other threads exist, which inherit the class
-    scheduling = realtime.enter_realtime_below(given.priority) if given.priority else "ordinary"
+    scheduling = realtime.enter_realtime_below(arguments.priority) if arguments.priority else "ordinary"
     log.info("guarding, scheduling %s", scheduling)
-    sizes = json.loads(given.layout)
+    sizes = json.loads(arguments.layout)
     layout = SharedStateLayout(**{**sizes, "cameras": tuple(sizes["cameras"])})
-    shared = SharedState.attach(layout, given.shared)
-    shared.hang(given.bells)
-    member = Membership(shared, given.boot, Lifeline())
+    shared = SharedState.attach(layout, arguments.shared)
+    shared.hang(arguments.bells)
+    member = Membership(shared, arguments.boot, Lifeline())
     clock = MonotonicClock()
-    guard = Guard(member.shared, Latch(given.folder), clock, given.period, given.station)
-    desk = EStopServer(guard, member.shared, zmq.Context.instance(), given.folder)
+    guard = Guard(member.shared, Latch(arguments.folder), clock, arguments.period, arguments.station)
+    desk = EStopServer(guard, member.shared, zmq.Context.instance(), arguments.folder)
     while member.is_needed(clock.now()):
         member.shared.beat("guard", clock.now())
         guard.poll()
-        desk.serve(given.rest)
+        desk.serve(arguments.rest)
     desk.close()
 
 

@@ -174,9 +174,9 @@ def check(spec: StationSpec) -> None:
     Its stamps have no relation to the virtual clock: a run would only hold because joints seem too old.
     """
     kind = spec.deployment.transport.kind
-    known = variants("runtime.transports")
-    if getattr(known[kind], "REAL_TIME", False):
-        lasting = (name for name, module in known.items() if not getattr(module, "REAL_TIME", False))
+    modules = variants("runtime.transports")
+    if getattr(modules[kind], "REAL_TIME", False):
+        lasting = (name for name, module in modules.items() if not getattr(module, "REAL_TIME", False))
         allowed = ", ".join(sorted(lasting))
         raise SetupError(
             f"transport.kind = {kind!r} with --lockstep: its other end runs in real time, and lockstep has a "
@@ -200,13 +200,17 @@ def run(spec: StationSpec, longest: float = 3600.0, peers: Peers | None = None) 
             raise SetupError(f"set-up failed: {session.reason}")
         station.command("run")
         how = station.until(lambda: session.state is not SessionState.RUNNING, longest, "run")
-        why = session.reason
+        reason = session.reason
         if how is SessionState.HOLDING:
             station.command("stop")
         for _ in range(3):  # the end passes from the coordinator to media and back
             station.tick()
         return LockstepRun(
-            station.coordinator.runs.last_episode, how, why, station.step, station.coordinator.events.since(0)
+            station.coordinator.runs.last_episode,
+            how,
+            reason,
+            station.step,
+            station.coordinator.events.since(0),
         )
     finally:
         station.close()

@@ -146,8 +146,8 @@ class ServedLockstep(Lockstep):
     def tick(self) -> None:
         """Run one control period; if the source's run is over, the station's run ends within this period."""
         super()._advance_clock()
-        if why := self._over(self.coordinator.session.state is SessionState.RUNNING):
-            self.coordinator.end_source_run(why)
+        if reason := self._over(self.coordinator.session.state is SessionState.RUNNING):
+            self.coordinator.end_source_run(reason)
         super().tick()
         self._figures.add(0.0, 0)
         if self.step % _FIGURES_EVERY == 0:

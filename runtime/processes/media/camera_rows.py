@@ -107,12 +107,15 @@ class CameraRows:
     def sizes(self, seen: Observation) -> dict[str, dict[str, int]]:
         """Return width and height of each video, and of the camera's pictures if these are scaled for the video."""
         pictures = {camera: seen.pictures[camera] for camera in self._cameras}
-        given = {camera: (picture.shape[0], picture.shape[1]) for camera, picture in pictures.items()}
+        captured = {camera: (picture.shape[0], picture.shape[1]) for camera, picture in pictures.items()}
         sizes = {}
-        for camera, (height, width) in self._settings.sizes(given).items():
+        for camera, (height, width) in self._settings.sizes(captured).items():
             sizes[camera] = {"width": width, "height": height}
-            if (height, width) != given[camera]:
-                sizes[camera] |= {"captured_width": given[camera][1], "captured_height": given[camera][0]}
+            if (height, width) != captured[camera]:
+                sizes[camera] |= {
+                    "captured_width": captured[camera][1],
+                    "captured_height": captured[camera][0],
+                }
         return sizes
 
     def pictures(self, seen: Observation | None) -> Mapping[str, UInt8 | None]:

@@ -83,12 +83,12 @@ def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | 
     if errors[0] is None or errors[1] is None or flags is None:
         return None, None, None
     shape = (len(answer.actions), flags.shape[1])
-    made: list[Float32] = []
+    misses: list[Float32] = []
     for error in errors:
         assert error is not None
         worst = np.full(shape, np.nan, np.float32)
         np.fmax.at(worst, answer.source_rows, error.astype(np.float32))
-        made.append(worst)
+        misses.append(worst)
     gathered = np.zeros(shape, np.uint8)
     np.bitwise_or.at(gathered, answer.source_rows, flags)
-    return made[0], made[1], gathered
+    return misses[0], misses[1], gathered

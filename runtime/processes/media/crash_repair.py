@@ -17,8 +17,8 @@ log = logging.getLogger(__name__)
 
 def start_repair(root: Path, station: str, repaired: Callable[[Path], None]) -> None:
     """Start the repair on a thread, so that new observations and recordings do not wait for it."""
-    given = (find_open_episodes(root), station, repaired)
-    threading.Thread(target=repair_open_episodes, args=given, name="repair", daemon=True).start()
+    arguments = (find_open_episodes(root), station, repaired)
+    threading.Thread(target=repair_open_episodes, args=arguments, name="repair", daemon=True).start()
 
 
 def find_open_episodes(root: Path) -> list[Path]:
@@ -40,8 +40,8 @@ def repair_open_episodes(
             continue
         try:
             report = repair(folder)
-            found = report.problem or f"{report.frames} rows"
-            log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, found)
+            finding = report.problem or f"{report.frames} rows"
+            log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, finding)
             if report.verdict in ("repaired", "restored", "complete"):
                 repaired(folder)
         except RecordingError as error:

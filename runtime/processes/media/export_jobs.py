@@ -72,6 +72,6 @@ class ExportQueue:
             text=True,
         )
         assert child.stderr is not None
-        said = child.stderr.read().strip()  # communicate() would close its standard input, which ends it
+        text = child.stderr.read().strip()  # communicate() would close its standard input, which ends it
         if child.wait():
-            log.error("%s is not exported: %s", folder, said or f"its process exited with {child.returncode}")
+            log.error("%s is not exported: %s", folder, text or f"its process exited with {child.returncode}")

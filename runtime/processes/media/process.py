@@ -286,8 +286,8 @@ class Media:
             log.error("episode %s was not closed within %g s", self._closing_uuid, seconds)
         while (late := self._unclosed.finish(seconds)) is not None:
             self._closed(late)
-        for uuid, why in self._unclosed.errors.items():
-            log.error("episode %s has no outcome, the next start completes it: %s", uuid, why)
+        for uuid, reason in self._unclosed.errors.items():
+            log.error("episode %s has no outcome, the next start completes it: %s", uuid, reason)
 
     def report_closed(self) -> None:
         """Inform the coordinator of episodes that have been closed."""
@@ -300,8 +300,8 @@ class Media:
 
     def _closed(self, closed: ClosedEpisode) -> None:
         waits = closed.retry is not None
-        path, told = str(closed.path), (closed.status, closed.reason, closed.rows, closed.error)
-        self._send(EpisodeClosed(closed.uuid, path, *told, waits))
+        path, outcome = str(closed.path), (closed.status, closed.reason, closed.rows, closed.error)
+        self._send(EpisodeClosed(closed.uuid, path, *outcome, waits))
         if waits:
             log.error("episode %s waits for room on the disk: %s", closed.uuid, closed.error)
             self._unclosed.add(closed)
@@ -318,8 +318,8 @@ class Media:
         recorder, now = self._recorder, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         recording = recorder.recording or self._closing_uuid  # until it is on disk
-        told = (recorder.rows, recording, recorder.repeated, self._unclosed.errors)
-        self._send(MediaReport(now, *told))
+        fields = (recorder.rows, recording, recorder.repeated, self._unclosed.errors)
+        self._send(MediaReport(now, *fields))
 
     def _emit_truth(self, reached: Mapping[str, float]) -> None:
         """Report the final state of a simulated bench and the times of its milestones: the episode's score."""
@@ -370,7 +370,7 @@ def main() -> None:
     start_repair(spec.deployment.episodes_dir, spec.deployment.station, exports.submit)
     previews = LowPriorityWorker(Previews(spec))  # previews may be late on a busy machine, recordings may not
     media = Media(shared, make_recorder(spec, clock.now), clock, previews, in_background, exports.submit)
-    bell, rest = shared.bells["media"], rest_s(spec.deployment.control.heartbeat_timeout_s)
+    bell, wait_s = shared.bells["media"], rest_s(spec.deployment.control.heartbeat_timeout_s)
     try:
         while not member.lifeline.is_cut:
             now = clock.now()
@@ -384,7 +384,7 @@ def main() -> None:
                 )
             if media.rests:
                 shared.set_unrecorded(True)
-                bell.wait(rest)
+                bell.wait(wait_s)
             else:
                 clock.sleep_until(now + _PERIOD_S)
     finally:

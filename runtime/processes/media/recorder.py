@@ -151,24 +151,26 @@ class Recorder:
         self._uuid = ""
         outcome = Outcome("failed" if error else status, error or reason, time.time(), details)
 
-        told = list(lost)
+        losses = list(lost)
 
         def attempt(finish: Callable[[], None]) -> ClosedEpisode:
-            failure, again = error, None
+            failure, retry = error, None
             try:
                 finish()
             except UnclosedError as fault:
-                failure, again = str(fault), partial(attempt, fault.again)
+                failure, retry = str(fault), partial(attempt, fault.again)
             except RecordingError as fault:
                 failure = str(fault)
-            why = "; ".join(filter(None, (failure or reason, *told)))
-            return ClosedEpisode(identity, path, "failed" if failure else status, why, rows, failure, again)
+            causes = "; ".join(filter(None, (failure or reason, *losses)))
+            return ClosedEpisode(
+                identity, path, "failed" if failure else status, causes, rows, failure, retry
+            )
 
         def end_journal() -> None:
             try:
                 self._journal.end(outcome)
             finally:
-                told.extend(loss.text for loss in self._journal.pop_lost_cameras())
+                losses.extend(loss.text for loss in self._journal.pop_lost_cameras())
 
         return partial(attempt, end_journal)
 
@@ -181,8 +183,8 @@ class Recorder:
             self._news.append(
                 Event(VIDEO_LOST, loss.text, self._now(), data={"camera": loss.camera, "row": loss.row})
             )
-        told, self._news = self._news, []
-        return told
+        events, self._news = self._news, []
+        return events
 
     # --- input ---------------------------------------------------------------------------------------------
 
@@ -217,21 +219,21 @@ class Recorder:
         if self._first_step is None:
             self._first_step = tick.step
         self._journal.append(tick)
-        here = (tick, self._observation(tick.sequence))
+        pair = (tick, self._observation(tick.sequence))
         # After a gap of missed ticks several rows may be complete; those within the gap repeat the tick before it.
         while (target := self._target(self.rows)) <= tick.step:
-            chosen = here if target == tick.step or self._before is None else self._before
+            chosen = pair if target == tick.step or self._before is None else self._before
             self._write_row(*chosen)
-        self._before = here
-        self._complete = here[1] is not None and here[1].last
+        self._before = pair
+        self._complete = pair[1] is not None and pair[1].last
 
     def _reported_tick(self, tick: ExecutedTick) -> ExecutedTick | None:
         """Return the tick with the action that a node-driven robot reported; None before its first report.
 
         If the node reported none for this frame, the last action is repeated with source "none".
         """
-        seen = self._observation(tick.sequence)
-        reported = None if seen is None else seen.reported_action
+        observation = self._observation(tick.sequence)
+        reported = None if observation is None else observation.reported_action
         if reported is not None:
             self._applied = reported
         if self._applied is None:
@@ -250,16 +252,16 @@ class Recorder:
                 return observation
         return None
 
-    def _write_row(self, tick: ExecutedTick, seen: Observation | None) -> None:
-        """Write one row; `seen` is the tick's observation, None if it is no longer available.
+    def _write_row(self, tick: ExecutedTick, observation: Observation | None) -> None:
+        """Write one row; `observation` is the tick's observation, None if it is no longer available.
 
         Joints come from the tick.
         """
         action = tick.qpos if tick.executed is None else tick.executed
-        measured = None if seen is None else seen.eef
-        reported = None if seen is None else _reported_eef(seen, action)
+        measured = None if observation is None else observation.eef
+        reported = None if observation is None else _reported_eef(observation, action)
         with_eef = bool(self._grid.robot["eef_dim"])
-        pictures = self._shown.pictures(seen)
+        pictures = self._shown.pictures(observation)
         self.repeated += sum(picture is None for picture in pictures.values())
         for event in self._shown.check_ages(tick.planned, self.rows):
             self._news.append(event)
@@ -271,11 +273,11 @@ class Recorder:
             sequence=tick.sequence,
             qpos=tick.qpos,
             action=action,
-            captured={} if seen is None else seen.captured,
+            captured={} if observation is None else observation.captured,
             pictures=pictures,
             control_source=tick.source,
-            qvel=None if seen is None else seen.qvel,
-            effort=None if seen is None else seen.effort,
+            qvel=None if observation is None else observation.qvel,
+            effort=None if observation is None else observation.effort,
             eef=self._eef(measured, tick.qpos) if with_eef else None,
             eef_action=self._eef(reported, action) if with_eef else None,
             eef_measured=measured is not None,
@@ -283,26 +285,26 @@ class Recorder:
             intervention=tick.source == "teleop",
             stale=self._shown.stale,
             lost=self._shown.lost,
-            bench=self._bench_changed(seen),
+            bench=self._bench_changed(observation),
         )
         self._journal.append(row)
         self.rows += 1
 
-    def _bench_changed(self, seen: Observation | None) -> str | None:
+    def _bench_changed(self, observation: Observation | None) -> str | None:
         """Return the ground truth of a simulated bench if it differs from the previous row, else None."""
-        said = "" if seen is None or not seen.truth else truth_text(seen.truth)
-        if not said or said == self._bench:
+        text = "" if observation is None or not observation.truth else truth_text(observation.truth)
+        if not text or text == self._bench:
             return None
-        self._bench = said
-        return said
+        self._bench = text
+        return text
 
-    def _eef(self, told: Float32 | None, joints: Float32) -> Float32:
-        """Return the reported poses `told`; if None, the poses of `joints` by forward kinematics."""
-        return self._grid.eef_of(joints) if told is None else told
+    def _eef(self, eef: Float32 | None, joints: Float32) -> Float32:
+        """Return the reported poses `eef`; if None, the poses of `joints` by forward kinematics."""
+        return self._grid.eef_of(joints) if eef is None else eef
 
 
-def _reported_eef(seen: Observation, action: Float32) -> Float32 | None:
+def _reported_eef(observation: Observation, action: Float32) -> Float32 | None:
     """Return the poses that the robot reported for exactly this action; None otherwise."""
-    if seen.reported_action is None or not np.array_equal(seen.reported_action, action):
+    if observation.reported_action is None or not np.array_equal(observation.reported_action, action):
         return None
-    return seen.reported_action_eef
+    return observation.reported_action_eef

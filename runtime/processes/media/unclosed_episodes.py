@@ -15,23 +15,23 @@ Close = Callable[[], ClosedEpisode]
 
 def at_once(close: Close) -> Future[ClosedEpisode]:
     """Close an episode immediately, as lockstep does."""
-    done: Future[ClosedEpisode] = Future()
-    done.set_result(close())
-    return done
+    future: Future[ClosedEpisode] = Future()
+    future.set_result(close())
+    return future
 
 
 def in_background(close: Close) -> Future[ClosedEpisode]:
     """Close an episode on a thread of its own, so that a slow disk delays nothing else."""
-    done: Future[ClosedEpisode] = Future()
+    future: Future[ClosedEpisode] = Future()
 
     def run() -> None:
         try:
-            done.set_result(close())
+            future.set_result(close())
         except Exception as error:  # raised by the future's result
-            done.set_exception(error)
+            future.set_exception(error)
 
     threading.Thread(target=run, name="closing", daemon=True).start()
-    return done
+    return future
 
 
 _FIRST_S, _MOST_S = 1.0, 30.0  # pauses between attempts [s], doubled each time
@@ -64,9 +64,9 @@ class UnclosedEpisodes:
     def poll(self) -> ClosedEpisode | None:
         """Return an episode that is closed now, or None; start an attempt if one is due. Never waits for the disk."""
         if self._attempt is None and self._episodes and not self._back_off.remaining_delay(self._now()):
-            again = self._episodes[0].retry
-            assert again is not None
-            self._attempt = self._closer(again)
+            retry = self._episodes[0].retry
+            assert retry is not None
+            self._attempt = self._closer(retry)
         if self._attempt is None or not self._attempt.done():
             return None
         closed, self._attempt = self._attempt.result(), None

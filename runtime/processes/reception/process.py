@@ -112,8 +112,8 @@ class Reception:
         intake, now = self._intake, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         faults, rates = intake.faults(), intake.rates()
-        told = (intake.truth, intake.drives, intake.cameras, intake.age_ms(), self._scheduling)
-        self._send(ReceptionReport(now, rates, faults, *told))
+        fields = (intake.truth, intake.drives, intake.cameras, intake.age_ms(), self._scheduling)
+        self._send(ReceptionReport(now, rates, faults, *fields))
 
     def _hand_on(self, observation: Observation, numbers: Mapping[str, int]) -> None:
         """Send an observation to media.

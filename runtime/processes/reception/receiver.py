@@ -99,16 +99,16 @@ class ObservationReceiver:
             self._say(event)
         now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
         for name, count in faults.items():
-            known = self._faults[name] = min(
+            previous = self._faults[name] = min(
                 count, self._faults.get(name, 0)
             )  # a restarted source counts from 0
-            again = math.inf if name.endswith(_STANDING) else _REPEAT_S
-            if count > known and now - self._said_at.get(name, -math.inf) >= again:
+            repeat_s = math.inf if name.endswith(_STANDING) else _REPEAT_S
+            if count > previous and now - self._said_at.get(name, -math.inf) >= repeat_s:
                 self._faults[name], self._said_at[name] = count, now
-                why = self._source.describe_fault(name)
+                reason = self._source.describe_fault(name)
                 named = name.replace("_", " ").replace(".", ": ")
                 text = _SOURCE_FAULT(fault=named, count=count)
-                text = _BECAUSE(what=text, why=why) if why else text
+                text = _BECAUSE(what=text, why=reason) if reason else text
                 self._say(Event(f"source_{name}", text, now, data={"count": count}))
         return faults
 
@@ -140,8 +140,8 @@ class ObservationReceiver:
             self._failure = ""
         return observation
 
-    def _accept(self, given: Observation) -> None:
-        observation = self._drop_unknown_images(given)
+    def _accept(self, received: Observation) -> None:
+        observation = self._drop_unknown_images(received)
         # The order matters: pictures are in their slots before their numbers are published, and media has an
         # observation before a tick can use it.
         for camera, picture in observation.pictures.items():
@@ -166,13 +166,15 @@ class ObservationReceiver:
         Pictures of unknown cameras, and pictures that are too large, are removed.
         """
         most = self._shared_state.layout.picture_bytes
-        ours = {camera: seen for camera, seen in observation.pictures.items() if camera in self._numbers}
-        large = {camera for camera, picture in ours.items() if picture.nbytes > most}
+        pictures = {
+            camera: image for camera, image in observation.pictures.items() if camera in self._numbers
+        }
+        large = {camera for camera, picture in pictures.items() if picture.nbytes > most}
         self._too_large.update(f"picture_too_large_{camera}" for camera in large)
         return replace(
             observation,
             sequence=self._before + observation.sequence,
-            pictures={camera: picture for camera, picture in ours.items() if camera not in large},
+            pictures={camera: picture for camera, picture in pictures.items() if camera not in large},
             captured={name: time for name, time in observation.captured.items() if name not in large},
         )
 

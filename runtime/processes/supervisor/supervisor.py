@@ -126,11 +126,11 @@ class Supervisor:
         )
 
     def _reader_arguments(self, process: str) -> tuple[str, ...]:
-        known = CAPABILITIES.dump_json(self._plan.capabilities).decode()
+        capabilities = CAPABILITIES.dump_json(self._plan.capabilities).decode()
         return (
             "--resolved",
             str(self._resolved),
-            *(() if process == "headless" else ("--capabilities", known)),
+            *(() if process == "headless" else ("--capabilities", capabilities)),
         )
 
     def _guard_arguments(self) -> tuple[str, ...]:

@@ -57,10 +57,10 @@ class Mixture:
         Where a format is ambiguous, the numbers are as close to those of `newest` as possible.
         """
         layout = self._layout_of(like)
-        made = layout.encode(self._end_effectors.vectors(joints), joints, newest)
+        encoded = layout.encode(self._end_effectors.vectors(joints), joints, newest)
         switched = self._switched(like)
-        made[:, switched] = newest[:, switched]
-        return made
+        encoded[:, switched] = newest[:, switched]
+        return encoded
 
     def relative(
         self, joints: Float64, newest: Float64, like: ActionChunk, observation: Observation
@@ -75,18 +75,18 @@ class Mixture:
         still = [*robot.gripper_dims, *robot.speed_dims]  # absolute in every mode
         moved[:, still] = joints[:, still]
         if like.space == "joint":
-            made = moved
+            encoded = moved
         else:
             layout, at = self._layout_of(like), qpos[None]
-            seen = self._end_effectors.eef_of(qpos) if observation.eef is None else observation.eef
-            vectors = np.asarray(seen, np.float64).reshape(1, -1, EEF_WIDTH)
+            eef = self._end_effectors.eef_of(qpos) if observation.eef is None else observation.eef
+            vectors = np.asarray(eef, np.float64).reshape(1, -1, EEF_WIDTH)
             start = layout.frame.express(layout.normalize_quaternions(vectors), at)[0]
             poses = layout.frame.express(self._end_effectors.vectors(joints), at)
             poses = relative(poses, start, like.mode, like.frame)
-            made = layout.written(poses, moved[:, layout.dims], newest)
+            encoded = layout.written(poses, moved[:, layout.dims], newest)
         switched = self._switched(like)
-        made[:, switched] = newest[:, switched]
-        return made
+        encoded[:, switched] = newest[:, switched]
+        return encoded
 
     def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
         """Return True if the linear mixture `straight` equals `meant` within tolerance.
@@ -96,10 +96,12 @@ class Mixture:
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)
         try:
-            one, other = (self._layout_of(like).decode(rows)[0][..., 3:7] for rows in (straight, meant))
+            straight_quaternions, meant_quaternions = (
+                self._layout_of(like).decode(rows)[0][..., 3:7] for rows in (straight, meant)
+            )
         except PolicyError:  # they determine no orientation
             return False
-        cosines = np.abs((one * other).sum(axis=-1))
+        cosines = np.abs((straight_quaternions * meant_quaternions).sum(axis=-1))
         return bool(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)).max(initial=0.0) <= _ROUND)
 
     def _switched(self, like: ActionChunk) -> list[int]:
@@ -110,9 +112,9 @@ class Mixture:
         return [place for place, dim in self._layout_of(like).commanded if dim in binary]
 
     def _layout_of(self, like: ActionChunk) -> PoseRows:
-        wanted = CANONICAL if like.pose is None else like.pose
-        if self._layout is None or self._layout.pose != wanted:
-            self._layout = PoseRows(wanted, self._loaded_robot)
+        pose = CANONICAL if like.pose is None else like.pose
+        if self._layout is None or self._layout.pose != pose:
+            self._layout = PoseRows(pose, self._loaded_robot)
         return self._layout
 
     @cached_property
@@ -128,6 +130,6 @@ class Mixture:
 def _mixed(parts: MixtureParts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
     """Mix rows as the newest row plus weighted differences, so that equal rows stay equal to the last bit."""
     apart = difference(parts.rows, parts.newest, wrapping)
-    made: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)
-    made[:, list(switched)] = parts.newest[:, list(switched)]
-    return made
+    mixed: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)
+    mixed[:, list(switched)] = parts.newest[:, list(switched)]
+    return mixed

@@ -146,10 +146,10 @@ class Inference:
         """Status of the last conditioning for a policy that continues its chunks; {} for other strategies."""
         if not self.continues:
             return {}
-        given = self._given
+        conditioning = self._given
         return {
-            "conditioned": given is not None,
-            "predicted_delay": given.predicted_delay if given else None,
+            "conditioned": conditioning is not None,
+            "predicted_delay": conditioning.predicted_delay if conditioning else None,
             "warning": self.rtc_warning,
         }
 
@@ -208,8 +208,8 @@ class Inference:
     def commit(self) -> None:
         """Send the proposal to control; no row is stale, because the robot was at rest during the review."""
         if self.proposal is not None:
-            answered, self.proposal = self.proposal, None
-            self._post(answered)
+            proposal, self.proposal = self.proposal, None
+            self._post(proposal)
 
     def cancel(self) -> None:
         """Discard the requested, shown or sent chunk, and clear failures."""
@@ -230,23 +230,23 @@ class Inference:
 
     def on_merged(self, merged: MergeResult) -> None:
         """Record that control has merged or dropped a chunk."""
-        answered = self._unmerged.pop(merged.chunk_id, None)
+        response = self._unmerged.pop(merged.chunk_id, None)
         if merged.run != self._run:
             return
         self.metrics.add_merge(merged)
         self._commitment.on_merged(merged)
-        if answered is not None:
+        if response is not None:
             state = "dropped" if merged.dropped else "merged"
-            step = answered.observation.step
+            step = response.observation.step
             self.shown = DisplayedChunk(
                 merged.chunk_id,
                 merged.run,
                 state,
                 step,
                 merged.targets,
-                answered.commands.rows,
+                response.commands.rows,
                 merged.overlap,
-                answered.ik,
+                response.ik,
             )
             if not merged.dropped:
                 self._planned = self.shown
@@ -255,8 +255,8 @@ class Inference:
         """Return the action for `step` [D] in the newest merged chunk; None if it has none."""
         if self._planned is None:
             return None
-        meant = np.flatnonzero(self._planned.targets == step)
-        return self._planned.rows[meant[-1]] if len(meant) else None
+        places = np.flatnonzero(self._planned.targets == step)
+        return self._planned.rows[places[-1]] if len(places) else None
 
     # --- requests and responses ------------------------------------------------------------------------------
 
@@ -325,7 +325,7 @@ class Inference:
 
     def _committed(self, observation: Observation) -> Conditioning | None:
         parameters = self._strategy.parameters
-        found = self._commitment.conditioning(
+        conditioning = self._commitment.conditioning(
             observation.step,
             list(self.metrics.delays)[-50:],
             parameters.delay_quantile,
@@ -335,52 +335,57 @@ class Inference:
         warning = self._commitment.warning
         if warning and not self.rtc_warning:  # its numbers change with every request
             self._note("rtc_warning", warning)
-        self.rtc_warning, self._given = warning, found
-        return found
+        self.rtc_warning, self._given = warning, conditioning
+        return conditioning
 
-    def _on_response(self, answered: PolicyResponse) -> PolicyAnswer:
-        answered = replace(answered, number=self._orders.next_chunk())
-        step, rows, ik = answered.observation.step, answered.commands.rows, answered.ik
-        self.requests.log_ik_problems(answered)
+    def _on_response(self, response: PolicyResponse) -> PolicyAnswer:
+        response = replace(response, number=self._orders.next_chunk())
+        step, rows, ik = response.observation.step, response.commands.rows, response.ik
+        self.requests.log_ik_problems(response)
         self._wanted = False
-        self.metrics.add_response(answered.seconds, answered.age, ik)
+        self.metrics.add_response(response.seconds, response.age, ik)
         self._commitment.add_chunk(
-            answered.number, answered.chunk, step, answered.requested_while_stopped, self._generation, rows
+            response.number, response.chunk, step, response.requested_while_stopped, self._generation, rows
         )
         if self._mode == "preview":
-            self.proposal = answered
+            self.proposal = response
             nowhere = np.full(len(rows), -1, np.int64)
-            self.shown = DisplayedChunk(answered.number, self._run, "proposed", step, nowhere, rows, ik=ik)
+            self.shown = DisplayedChunk(response.number, self._run, "proposed", step, nowhere, rows, ik=ik)
         else:
-            self._post(answered)
-        recorded = self._record(answered)
+            self._post(response)
+        recorded = self._record(response)
         self.retry.record_success()  # only now: a policy with unusable responses has not recovered
         return recorded
 
-    def _record(self, answered: PolicyResponse) -> PolicyAnswer:
-        solved = answered.commands.ik_result
+    def _record(self, response: PolicyResponse) -> PolicyAnswer:
+        solved = response.commands.ik_result
         return PolicyAnswer(
-            answered.number,
+            response.number,
             self._run,
-            answered.observation.step,
-            answered.chunk.actions,
-            answered.chunk.space,
-            answered.commands.source_rows,
-            answered.seconds * 1000.0,
+            response.observation.step,
+            response.chunk.actions,
+            response.chunk.space,
+            response.commands.source_rows,
+            response.seconds * 1000.0,
             position_error=None if solved is None else solved.position_error,
             rotation_error=None if solved is None else solved.rotation_error,
             ik_flags=None if solved is None else solved.flags,
-            eef=answered.eef if self.policy.uses_poses else "",
+            eef=response.eef if self.policy.uses_poses else "",
         )
 
-    def _post(self, answered: PolicyResponse) -> None:
-        made, step = answered.commands, answered.observation.step
+    def _post(self, response: PolicyResponse) -> None:
+        commands, step = response.commands, response.observation.step
         self._orders.send_chunk(
             PostedChunk(
-                answered.number, self._run, step, made.rows, answered.requested_while_stopped, made.first
+                response.number,
+                self._run,
+                step,
+                commands.rows,
+                response.requested_while_stopped,
+                commands.first,
             )
         )
-        self._unmerged[answered.number] = answered
+        self._unmerged[response.number] = response
 
     def _note(self, kind: str, text: str) -> None:
         self.pending_notes.append(Event(kind, text, self._clock.now()))

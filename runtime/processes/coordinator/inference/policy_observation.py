@@ -73,11 +73,11 @@ class PolicyObservation:
             PolicyError: there is no observation, or it is too old.
         """
         cameras = self._shared_state.layout.cameras if pictures else ()
-        seen = self._shared_state.read_observation(cameras)
-        if seen is None:
+        observation = self._shared_state.read_observation(cameras)
+        if observation is None:
             raise PolicyError(_NONE_YET)
         now, bounds = self._clock.now(), self._settings
-        for stream, captured in seen.captured.items():
+        for stream, captured in observation.captured.items():
             if not (pictures or stream in ("joints", "eef")):
                 continue
             allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
@@ -85,13 +85,13 @@ class PolicyObservation:
                 raise StaleObservationError(_NOTHING_YET(stream=stream))
             if not now - captured <= allowed:
                 raise StaleObservationError(_STALE(stream=stream, seconds=now - captured, allowed=allowed))
-        missing = [camera for camera in cameras if camera not in seen.pictures]
+        missing = [camera for camera in cameras if camera not in observation.pictures]
         if missing:
             raise PolicyError(_NO_PICTURE(cameras=", ".join(missing)))
-        told = self.commanded()
-        commanded = None if told is None else told[1]
-        shown = replace(seen, step=self._step_of(seen), prompt=prompt, commanded=commanded)
-        return self._of_the_simulated_robot(shown) if self.simulated else shown
+        newest = self.commanded()
+        commanded = None if newest is None else newest[1]
+        complete = replace(observation, step=self._step_of(observation), prompt=prompt, commanded=commanded)
+        return self._of_the_simulated_robot(complete) if self.simulated else complete
 
     def commanded(self) -> tuple[int, Float64] | None:
         """Return the newest control step and the commanded position [D] of the robot that executes chunks.
@@ -106,7 +106,7 @@ class PolicyObservation:
             return None
         return int(status["step"]), np.array(status["commanded"], np.float64)
 
-    def _step_of(self, seen: Observation) -> int:
+    def _step_of(self, observation: Observation) -> int:
         """Return the control step of an observation: that of the tick that used it, or of the next tick.
 
         If control stalls, the step is more than one ahead of the newest tick: steps follow the clock, and missed ticks
@@ -114,17 +114,17 @@ class PolicyObservation:
         """
         status = self._shared_state.control.read()
         step, planned = int(status["step"]), float(status["planned"])
-        if seen.sequence == int(status["sequence"]):
+        if observation.sequence == int(status["sequence"]):
             return step
-        periods = (seen.arrived - planned) * self._settings.control_rate if planned else 1.0
+        periods = (observation.arrived - planned) * self._settings.control_rate if planned else 1.0
         return step + max(1, math.ceil(periods - 1e-6))
 
-    def _of_the_simulated_robot(self, shown: Observation) -> Observation:
+    def _of_the_simulated_robot(self, observation: Observation) -> Observation:
         """Return the observation with the simulated robot's joints, without other measurements of the real robot.
 
         Before its first tick the simulated robot is where the real one is.
         """
         joints = np.array(self._shared_state.control.read()["simulated"], np.float32)
         if not np.isfinite(joints).all():
-            return shown
-        return replace(shown, qpos=joints, qvel=None, effort=None, eef=None)
+            return observation
+        return replace(observation, qpos=joints, qvel=None, effort=None, eef=None)

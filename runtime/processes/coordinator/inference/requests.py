@@ -204,51 +204,55 @@ class PolicyRequests:
             PolicyError: the observation is missing or too old.
         """
         observation = self.observe()
-        policy, fresh, held = self.policy, self._fresh, self._held
+        policy, fresh, holding = self.policy, self._fresh, self._held
         measured = observation.eef is not None and policy.observation_eef == "measured"
-        seen = observation if measured else replace(observation, eef=None)
-        conditioning = committed(seen) if committed else None
+        sample = observation if measured else replace(observation, eef=None)
+        conditioning = committed(sample) if committed else None
         self._fresh = self._held = False
 
         def infer() -> PolicyResponse:
             try:
                 if fresh:
                     policy.reset()
-                elif held:
+                elif holding:
                     policy.resume()
                 begun = self._clock.now()
-                shown = seen if measured else replace(seen, eef=self._spaces.eef_of(seen.qpos))
-                age = self._clock.now() - min(shown.captured.values())
-                chunk = policy.infer(shown, conditioning)
+                completed = sample if measured else replace(sample, eef=self._spaces.eef_of(sample.qpos))
+                age = self._clock.now() - min(completed.captured.values())
+                chunk = policy.infer(completed, conditioning)
             except PolicyLostError:  # the next connection knows nothing of the reset or resume
-                self._fresh, self._held = self._fresh or fresh, self._held or held
+                self._fresh, self._held = self._fresh or fresh, self._held or holding
                 raise
             seconds = self._clock.now() - begun
-            onset = self._chunk_start(shown, waited, waited or fresh, k_max)
-            made = self._spaces.to_command(chunk, shown, onset)
+            onset = self._chunk_start(completed, waited, waited or fresh, k_max)
+            commands = self._spaces.to_command(chunk, completed, onset)
             source: Literal["measured", "fk"] = "measured" if measured else "fk"
-            ik = {} if made.ik_result is None else ik_figures(made.ik_result)
-            made, refused = self._within(made, onset.first_row, fresh or held) if executed else (made, "")
-            return PolicyResponse(chunk, seconds, shown, made, waited, age, source, ik, refused)
+            ik = {} if commands.ik_result is None else ik_figures(commands.ik_result)
+            commands, refused = (
+                self._within(commands, onset.first_row, fresh or holding) if executed else (commands, "")
+            )
+            return PolicyResponse(chunk, seconds, completed, commands, waited, age, source, ik, refused)
 
         return self.runner.submit(infer)
 
-    def _chunk_start(self, shown: Observation, waited: bool, rests: bool, k_max: int | None) -> ChunkStart:
+    def _chunk_start(
+        self, observation: Observation, waited: bool, rests: bool, k_max: int | None
+    ) -> ChunkStart:
         """Return where the chunk will take over: the commanded position, and the first row that can be executed.
 
         That row follows the newest control step. If the robot is at rest, the chunk starts from the measured joints.
         """
-        qpos = np.asarray(shown.qpos, dtype=np.float64)
-        told = self.policy_observation.commanded()
-        if told is None:
+        qpos = np.asarray(observation.qpos, dtype=np.float64)
+        newest = self.policy_observation.commanded()
+        if newest is None:
             return ChunkStart(qpos, qpos)
-        step, commanded = told
+        step, commanded = newest
         # Computed when the response has arrived, so that rows of steps already sent are counted as passed.
-        passed = 0 if waited else max(0, step + 1 - shown.step)
+        passed = 0 if waited else max(0, step + 1 - observation.step)
         row = passed if k_max is None else min(passed, k_max)
         return ChunkStart(commanded, qpos if rests else commanded, row)
 
-    def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
+    def _within(self, commands: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
         """Return the rows before the first refused pose from row `first` on, and the reason, "" if none is refused.
 
         A pose is refused if it is out of reach, or if the joints would lag behind it by more than a jump. A smaller lag
@@ -258,32 +262,37 @@ class PolicyRequests:
         Raises:
             PolicyError: no row remains.
         """
-        solved, bound = made.ik_result, self._bound
+        solved, bound = commands.ik_result, self._bound
         if solved is None or bound is None:
-            return made, ""
-        first = min(first, len(made.rows) - 1)
+            return commands, ""
+        first = min(first, len(commands.rows) - 1)
         missed = first + np.flatnonzero(bound.misses(solved)[first:].any(axis=1))
-        found = ((int(row), *self._refused(made, int(row), bound)) for row in missed)
-        row, wrong, in_reach = next((one for one in found if one[1]), (-1, "", False))
+        results = ((int(row), *self._refused(commands, int(row), bound)) for row in missed)
+        row, wrong, in_reach = next((result for result in results if result[1]), (-1, "", False))
         if not wrong:
-            return made, ""
-        kept = row + 1 if row == first and begins and in_reach else row
-        if kept <= first:
+            return commands, ""
+        usable = row + 1 if row == first and begins and in_reach else row
+        if usable <= first:
             raise PolicyError(wrong)
         met = IkResult(
-            solved.q[:kept], solved.position_error[:kept], solved.rotation_error[:kept], solved.flags[:kept]
+            solved.q[:usable],
+            solved.position_error[:usable],
+            solved.rotation_error[:usable],
+            solved.flags[:usable],
         )
-        cut = replace(made, rows=made.rows[:kept], source_rows=made.source_rows[:kept], ik_result=met)
-        return cut, _ROWS_REFUSED(wrong=wrong, kept=kept - first)
+        cut = replace(
+            commands, rows=commands.rows[:usable], source_rows=commands.source_rows[:usable], ik_result=met
+        )
+        return cut, _ROWS_REFUSED(wrong=wrong, kept=usable - first)
 
-    def _refused(self, made: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
+    def _refused(self, commands: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
         """Return the reason why row `row` is refused, "" if it is not, and whether its pose is within reach."""
-        free, distance = self._spaces.meet(made, row)
+        free, distance = self._spaces.meet(commands, row)
         over = bound.misses(free)[0]
         if over.any():
             arm = int(over.argmax())
             return _OUT_OF_REACH(
-                row=made.source_rows[row],
+                row=commands.source_rows[row],
                 arm=self._spaces.arm_names[arm],
                 mm=1000.0 * free.position_error[0, arm],
                 deg=np.degrees(free.rotation_error[0, arm]),
@@ -291,7 +300,7 @@ class PolicyRequests:
                 allowed_deg=np.degrees(bound.rotation),
             ), False
         if distance > bound.jump:
-            return _TOO_FAR(row=made.source_rows[row], distance=distance, allowed=bound.jump), True
+            return _TOO_FAR(row=commands.source_rows[row], distance=distance, allowed=bound.jump), True
         return "", True
 
     def check_measured_poses(self, answered: PolicyResponse) -> None:
@@ -302,14 +311,14 @@ class PolicyRequests:
         Raises:
             SetupError: they differ, and the policy uses them.
         """
-        shown = answered.observation
-        if answered.eef != "measured" or shown.eef is None:
+        observation = answered.observation
+        if answered.eef != "measured" or observation.eef is None:
             return
-        wrong = self._spaces.pose_mismatch(shown.eef, shown.qpos)
+        wrong = self._spaces.pose_mismatch(observation.eef, observation.qpos)
         if wrong and self.policy.uses_poses:
             raise SetupError(_EEF_DISAGREES(wrong=wrong))
         if wrong:
-            self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), shown.step))
+            self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), observation.step))
 
     def log_ik_problems(self, answered: PolicyResponse) -> None:
         """Queue an event if poses of a response were refused or not reached."""

@@ -115,8 +115,8 @@ class RtcPrefix:
         if generation is None or generation == self.generation:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
             pace = (chunk.rate or self._control_rate) / self._control_rate
-            made = len(rows) if commands is None else _source_row_count(len(commands), pace)
-            self._on_the_way[chunk_id] = _PendingChunk(chunk, observation_step, waited, rows, made)
+            source_rows = len(rows) if commands is None else _source_row_count(len(commands), pace)
+            self._on_the_way[chunk_id] = _PendingChunk(chunk, observation_step, waited, rows, source_rows)
 
     def on_merged(self, merged: MergeResult) -> None:
         """Commit a chunk that control has merged; a dropped chunk is removed."""
@@ -126,7 +126,9 @@ class RtcPrefix:
         chunk = answer.chunk
         rows = chunk.actions if chunk.model_actions is None else chunk.model_actions
         pace = (chunk.rate or self._control_rate) / self._control_rate
-        over = [number for number, held in self._merged.items() if held.end < answer.observation_step]
+        over = [
+            number for number, committed in self._merged.items() if committed.end < answer.observation_step
+        ]
         for number in over:  # later requests are about later steps than all of its steps
             del self._merged[number]
         self._merged[merged.chunk_id] = _CommittedChunk(
@@ -167,87 +169,91 @@ class RtcPrefix:
         self.warning, self.predicted_delay = "", 0
         if not self._merged:
             return None
-        held = self._merged[max(self._merged)]
-        chunk = held.chunk
+        committed = self._merged[max(self._merged)]
+        chunk = committed.chunk
         if chunk.model_actions is not None and (chunk.mode != "absolute" or chunk.model_relative):
             self.warning = _MODEL_ROWS_RELATIVE
             return None
-        passed = math.floor((observation_step - held.anchor) * held.pace + 0.5 + _HAIR)
+        passed = math.floor((observation_step - committed.anchor) * committed.pace + 0.5 + _HAIR)
         consumed = max(0, passed)
-        steps = observation_step + np.arange(held.usable - consumed) / held.pace
-        steps = steps[np.ceil(steps - _HAIR) < held.end]
+        steps = observation_step + np.arange(committed.usable - consumed) / committed.pace
+        steps = steps[np.ceil(steps - _HAIR) < committed.end]
         if not len(steps):
             return None
-        delay = _expected(delays or [held.delay], quantile)
-        self.predicted_delay = max(0, math.ceil(delay * held.pace - _HAIR))
-        self._judge(delay, held.end - observation_step)
-        previous = self._planned(held, steps, passed, observation)
+        delay = _expected(delays or [committed.delay], quantile)
+        self.predicted_delay = max(0, math.ceil(delay * committed.pace - _HAIR))
+        self._judge(delay, committed.end - observation_step)
+        previous = self._planned(committed, steps, passed, observation)
         if previous is None:
             return None
-        last = held.usable
-        if held.chunk.mode != "absolute":  # unplanned rows are not relative to the new observation
+        last = committed.usable
+        if committed.chunk.mode != "absolute":  # unplanned rows are not relative to the new observation
             last = min(last, len(steps))
         if execution_horizon is not None:
-            last = min(last, math.ceil(execution_horizon * held.pace - _HAIR))
+            last = min(last, math.ceil(execution_horizon * committed.pace - _HAIR))
         return Conditioning(previous, consumed, min(self.predicted_delay, len(steps)), last)
 
     def _planned(
-        self, held: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
+        self, committed: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
-        """Return the rows of `held`, with the plan in place of its rows for `steps`; None if the plan is unknown.
+        """Return the rows of `committed`, with the plan in place of its rows for `steps`; None if the plan is unknown.
 
         `passed` is the row nearest to the first step. Rows that are not absolute are not mixed themselves: their joints
         are mixed, and converted back to such rows.
         """
-        made = [self._contributions_at(at) for at in steps.tolist()]
-        if held.chunk.mode != "absolute":
-            return self._from_here(held, steps, made, passed, observation)
-        known = [shares for shares in made if shares is not None and self._same_kind(held, shares)]
-        if len(known) < len(made):
+        contributions = [self._contributions_at(at) for at in steps.tolist()]
+        if committed.chunk.mode != "absolute":
+            return self._from_here(committed, steps, contributions, passed, observation)
+        contributors = [
+            shares for shares in contributions if shares is not None and self._same_kind(committed, shares)
+        ]
+        if len(contributors) < len(contributions):
             return None
-        whole = _repeat_last_row(held.rows, held.usable)  # without refused rows
-        exact = abs((steps[0] - held.anchor) * held.pace - max(0, passed)) < _HAIR
+        whole = _repeat_last_row(committed.rows, committed.usable)  # without refused rows
+        exact = abs((steps[0] - committed.anchor) * committed.pace - max(0, passed)) < _HAIR
         alone = {max(self._merged): 1.0}
-        mixed = [place for place, shares in enumerate(known) if not exact or shares != alone]
+        mixed = [place for place, shares in enumerate(contributors) if not exact or shares != alone]
         if not mixed:
             return whole
         rows = whole.copy()
-        found = self._mixed(steps[mixed], [known[place] for place in mixed])
-        if found is None:
+        mixed_rows = self._mixed(steps[mixed], [contributors[place] for place in mixed])
+        if mixed_rows is None:
             return None
-        rows[max(0, passed) + np.array(mixed)] = found
+        rows[max(0, passed) + np.array(mixed)] = mixed_rows
         return rows
 
     def _from_here(
         self,
-        held: _CommittedChunk,
+        committed: _CommittedChunk,
         steps: Float64,
-        made: Sequence[Shares | None],
+        contributions: Sequence[Shares | None],
         passed: int,
         observation: Observation | None,
     ) -> Float32 | None:
-        """Return the rows of `held`, which are not absolute, with the plan for `steps` relative to `observation`.
+        """Return the rows of `committed`, which are not absolute, with the plan for `steps` relative to `observation`.
 
-        `made` are the contributions to each step, `passed` is the row nearest to the first step. None if a contribution
-        is unknown.
+        `contributions` are those to each step, `passed` is the row nearest to the first step. None if a contribution is
+        unknown.
         """
         assert observation is not None, (
             "rows that are not absolute need the observation that they are relative to"
         )
-        known = [shares for shares in made if shares is not None and shares.keys() <= self._merged.keys()]
-        if len(known) < len(made):
+        contributors = [
+            shares for shares in contributions if shares is not None and shares.keys() <= self._merged.keys()
+        ]
+        if len(contributors) < len(contributions):
             return None
         places = max(0, passed) + np.arange(len(steps))
-        rows = held.rows.copy()
-        joints = self._mixture.joints(self._parts(steps, known, lambda one: (one.commands, 1.0)))
+        rows = committed.rows.copy()
+        joints = self._mixture.joints(self._parts(steps, contributors, lambda one: (one.commands, 1.0)))
         newest = rows[places].astype(np.float64)
-        rows[places] = self._mixture.relative(joints, newest, held.chunk, observation)
+        rows[places] = self._mixture.relative(joints, newest, committed.chunk, observation)
         return _repeat_last_row(rows, int(places[-1]) + 1)
 
-    def _same_kind(self, held: _CommittedChunk, shares: Shares) -> bool:
-        """Return True if all chunks in `shares` are merged and have the number format of `held`."""
-        others = [self._merged.get(number) for number in shares]
-        return all(other is not None and other.kind == held.kind for other in others)
+    def _same_kind(self, committed: _CommittedChunk, shares: Shares) -> bool:
+        """Return True if all chunks in `shares` are merged and have the number format of `committed`."""
+        chunks = [self._merged.get(number) for number in shares]
+        return all(chunk is not None and chunk.kind == committed.kind for chunk in chunks)
 
     def _contributions_at(self, at: float) -> Shares | None:
         """Return the weights of chunks at control step `at`, interpolated between steps; None if unknown."""
@@ -255,57 +261,59 @@ class RtcPrefix:
         part = at - before
         if part < _HAIR:
             return self._makers_of(before)
-        made: Shares = {}
+        contributions: Shares = {}
         for shares, weight in ((self._makers_of(before), 1.0 - part), (self._makers_of(before + 1), part)):
             if shares is None:
                 return None
             for chunk, share in shares.items():
-                made[chunk] = made.get(chunk, 0.0) + weight * share
-        return made
+                contributions[chunk] = contributions.get(chunk, 0.0) + weight * share
+        return contributions
 
     def _makers_of(self, step: int) -> Shares | None:
-        number = max((number for number, held in self._merged.items() if held.first <= step), default=HELD)
-        held = self._merged.get(number)
-        if held is None or held.contributions is None or step >= held.end:
+        number = max(
+            (number for number, committed in self._merged.items() if committed.first <= step), default=HELD
+        )
+        committed = self._merged.get(number)
+        if committed is None or committed.contributions is None or step >= committed.end:
             return None
-        return held.contributions.get(step, {number: 1.0})
+        return committed.contributions.get(step, {number: 1.0})
 
-    def _mixed(self, steps: Float64, made: Sequence[Shares]) -> Float64 | None:
-        """Return the rows for these control steps, mixed by the weights `made`.
+    def _mixed(self, steps: Float64, contributions: Sequence[Shares]) -> Float64 | None:
+        """Return the rows for these control steps, mixed by the weights `contributions`.
 
         None if rows in model space cannot be mixed linearly.
         """
         like, mixture = self._merged[max(self._merged)].chunk, self._mixture
-        actions = self._parts(steps, made, lambda held: (held.chunk.actions, held.pace))
+        actions = self._parts(steps, contributions, lambda held: (held.chunk.actions, held.pace))
         if like.space == "joint":
-            meant = mixture.joints(actions)
+            intended = mixture.joints(actions)
         else:
-            commands = self._parts(steps, made, lambda held: (held.commands, 1.0))
-            meant = mixture.poses(mixture.joints(commands), actions.newest, like)
+            commands = self._parts(steps, contributions, lambda held: (held.commands, 1.0))
+            intended = mixture.poses(mixture.joints(commands), actions.newest, like)
         if like.model_actions is None:
-            return meant
-        if not mixture.mixes_linearly(mixture.numbers(actions, like), meant, like):
+            return intended
+        if not mixture.mixes_linearly(mixture.numbers(actions, like), intended, like):
             return None
-        return mixture.numbers(self._parts(steps, made, lambda held: (held.rows, held.pace)), like)
+        return mixture.numbers(self._parts(steps, contributions, lambda held: (held.rows, held.pace)), like)
 
     def _parts(
         self,
         steps: Float64,
-        made: Sequence[Shares],
+        contributions: Sequence[Shares],
         table: Callable[[_CommittedChunk], tuple[Numbers, float]],
     ) -> MixtureParts:
-        """Return the components from which the rows for these steps are mixed, by the weights `made`.
+        """Return the components from which the rows for these steps are mixed, by the weights `contributions`.
 
         `table` returns for a chunk the rows to use, and their number per control step.
         """
         numbers: list[Numbers] = []
         weights: list[Float64] = []
         newest = np.zeros(len(steps), np.int64)
-        for number in sorted({number for shares in made for number in shares}):
-            held = self._merged[number]
-            rows, pace = table(held)
-            share = np.array([shares.get(number, 0.0) for shares in made])
-            places = np.clip((steps - held.anchor) * pace, 0, len(rows) - 1)
+        for number in sorted({number for shares in contributions for number in shares}):
+            committed = self._merged[number]
+            rows, pace = table(committed)
+            share = np.array([shares.get(number, 0.0) for shares in contributions])
+            places = np.clip((steps - committed.anchor) * pace, 0, len(rows) - 1)
             below = np.floor(places + _HAIR).astype(np.int64)
             part = np.clip(places - below, 0.0, 1.0)
             newest[share > 0.0] = len(numbers)

@@ -119,5 +119,5 @@ class ManualControl:
     def commanded(self) -> Float64:
         """Return the commanded position of the robot [D], or the measured one if it is not engaged."""
         status = self._shared_state.control.read()
-        known = status["commanded"] if status["engaged"] else self._shared_state.observation.read()["qpos"]
-        return np.array(known, np.float64)
+        joints = status["commanded"] if status["engaged"] else self._shared_state.observation.read()["qpos"]
+        return np.array(joints, np.float64)

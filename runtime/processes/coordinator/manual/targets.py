@@ -125,23 +125,25 @@ class Targets:
         return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.radian_scale).duration
 
     def _requested_joints(
-        self, what: str, joints: Sequence[float | None] | None, pose: str | None, commanded: Float64
+        self, label: str, joints: Sequence[float | None] | None, pose: str | None, commanded: Float64
     ) -> Float64:
         robot = self._plan.robot
         if joints is not None and pose is not None:
-            raise RuntimeFault(_JOINTS_AND_POSE(what=what, pose=pose))
+            raise RuntimeFault(_JOINTS_AND_POSE(what=label, pose=pose))
         if pose is not None:
             if pose not in robot.poses:
-                raise RuntimeFault(_NO_SUCH_POSE(what=what, pose=pose, robot=robot.name, poses=self._poses()))
+                raise RuntimeFault(
+                    _NO_SUCH_POSE(what=label, pose=pose, robot=robot.name, poses=self._poses())
+                )
             return np.array(robot.poses[pose], np.float64)
         if joints is None:
             return commanded.copy()
         if len(joints) != robot.dim:
             raise RuntimeFault(
-                _NUMBER_OF_JOINTS(what=what, given=len(joints), robot=robot.name, expected=robot.dim)
+                _NUMBER_OF_JOINTS(what=label, given=len(joints), robot=robot.name, expected=robot.dim)
             )
         return np.array(
-            [now if given is None else given for given, now in zip(joints, commanded, strict=True)]
+            [now if value is None else value for value, now in zip(joints, commanded, strict=True)]
         )
 
     def _poses(self) -> str:
@@ -175,10 +177,10 @@ class Targets:
 def _apply_jog(pose: Float64, jog: Jog) -> Float64:
     """Return the pose [7] (x, y, z, qw, qx, qy, qz) after the jog."""
     turn, shift = matrix_of_rpy(*jog.rotation), np.array(jog.translation, np.float64)
-    here = matrix_of_quaternion(pose[3:])
-    there = here @ turn if jog.frame == "tool" else turn @ here
-    way = here @ shift if jog.frame == "tool" else shift
-    return np.concatenate([pose[:3] + way, quaternion_of_matrix(there)])
+    rotation = matrix_of_quaternion(pose[3:])
+    turned = rotation @ turn if jog.frame == "tool" else turn @ rotation
+    moved = rotation @ shift if jog.frame == "tool" else shift
+    return np.concatenate([pose[:3] + moved, quaternion_of_matrix(turned)])
 
 
 def aim_to_dict(aim: TargetPreview, spec: StationSpec, distance: float, duration: float) -> dict[str, Any]:

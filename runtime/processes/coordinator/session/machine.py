@@ -127,13 +127,13 @@ class SessionMachine:
         first = self._answers.get(command.uuid)
         if first is not None and command.kind not in STOPPING:
             return self._ack(command, "refused", _UUID_OF_ANOTHER(kind=first.kind))
-        refusal, told = self._refusal(command), None
+        refusal, result = self._refusal(command), None
         if not refusal:
             try:
-                told = self._carry_out(command)
+                result = self._carry_out(command)
             except RuntimeFault as error:
                 refusal = str(error)
-        ack = self._ack(command, "refused" if refusal else "accepted", refusal, told)
+        ack = self._ack(command, "refused" if refusal else "accepted", refusal, result)
         if command.kind != "lease_renew":  # a stream, not a discrete command: there is nothing to repeat
             self._answers.setdefault(command.uuid, ack)
             if len(self._answers) > ANSWERS_KEPT:
@@ -227,8 +227,8 @@ class SessionMachine:
             return ""
         possible = ", ".join(allowed)
         if self.state in COMMANDS[kind].allowed:
-            why = COMMANDS[kind].guard(self.state, self._effects.situation)
-            return _NOT_ALLOWED_NOW(command=kind, why=why, allowed=possible)
+            reason = COMMANDS[kind].guard(self.state, self._effects.situation)
+            return _NOT_ALLOWED_NOW(command=kind, why=reason, allowed=possible)
         return _NOT_ALLOWED(command=kind, state=self.state, reason=self.reason, allowed=possible)
 
     def _carry_out(self, command: Command) -> TransitionResult | None:
@@ -246,14 +246,14 @@ class SessionMachine:
         if self.state is SessionState.SETTING_UP and command.kind in CANCELLING:
             rule = CANCEL
         takes = ARGUMENTS[command.kind]
-        asked = read(command.kind, takes, command.args) if takes else None
+        request = read(command.kind, takes, command.args) if takes else None
         self._effects.set_requester(command.user or command.holder, command.uuid)
-        told = rule.effect(self._effects, asked)
-        after = rule.next(self.state, asked)
+        result = rule.effect(self._effects, request)
+        after = rule.next(self.state, request)
         if after:
             reason = CANCELLED if rule is CANCEL else REASONS.get(command.kind, "")
             self._enter(after, reason)
-        return told
+        return result
 
     def _lease_command(self, command: Command) -> None:
         now = self._now()
@@ -280,11 +280,11 @@ class SessionMachine:
         self.sequence += 1
 
     def _ack(
-        self, command: Command, status: AckStatus, reason: str, told: TransitionResult | None = None
+        self, command: Command, status: AckStatus, reason: str, result: TransitionResult | None = None
     ) -> Ack:
-        held = self._lease.current(self._now())
-        lease = {"epoch": held.epoch, "holder": held.holder} if held else {}
-        data = {**(told or {}), **lease}
+        holder = self._lease.current(self._now())
+        lease = {"epoch": holder.epoch, "holder": holder.holder} if holder else {}
+        data = {**(result or {}), **lease}
         return Ack(
             command.uuid, status, reason, self.allowed(), self._boot, self.sequence, data, command.kind
         )

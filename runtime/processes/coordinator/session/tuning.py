@@ -39,9 +39,9 @@ def apply_tuning(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None)
     now = spec.deployment
     strategy = {**now.strategy.model_dump(), **(asked.strategy or {})}
     task = now.task if asked.task is None else asked.task
-    made = replace(
+    tuned = replace(
         spec, resolved=loader.apply_changes(spec.resolved, {"strategy": strategy, "task": task}, "tune")
     )
-    if info is not None and info.supports_rtc is False and strategy_of(made).query.uses_rtc:
+    if info is not None and info.supports_rtc is False and strategy_of(tuned).query.uses_rtc:
         raise RuntimeFault(_POLICY_WITHOUT_RTC(policy=info.name))
-    return made
+    return tuned

@@ -184,7 +184,7 @@ class SetUp:
             state = "waiting" if self.active or not self.stages else "skipped"
         seconds = 0.0
         if since is not None:
-            later = [at for other, at in self.stages.items() if other is not stage and at >= since]
+            later = [at for name, at in self.stages.items() if name is not stage and at >= since]
             seconds = min(later, default=now) - since
         return {"name": stage.sentence, "state": state, "seconds": seconds}
 
@@ -316,9 +316,9 @@ class SetUp:
             raise DrivesDisabledError(_DRIVES_DISABLED(faults=faults))
 
     def _check_cameras(self) -> None:
-        found = describe_camera_problems(self._reception().cameras)
-        if found:
-            raise SetupError(series(found))
+        problems = describe_camera_problems(self._reception().cameras)
+        if problems:
+            raise SetupError(series(problems))
 
     def _waited(self) -> float:
         return self._clock.now() - self._since
@@ -402,9 +402,9 @@ class SetUp:
             return False
         if not self._inference.runner.ready(self._asked):
             return False
-        asked, self._asked = self._asked, None
+        pending, self._asked = self._asked, None
         with as_policy_errors(_ANSWER_UNUSABLE):
-            self._validate(asked.result())
+            self._validate(pending.result())
         self._left -= 1
         return True
 
@@ -414,15 +414,15 @@ class SetUp:
         self.took.setdefault(name, waited)
         return waited >= least
 
-    def _validate(self, answered: PolicyResponse) -> None:
-        self._inference.requests.log_ik_problems(answered)
+    def _validate(self, response: PolicyResponse) -> None:
+        self._inference.requests.log_ik_problems(response)
         if self._left == self._plan.deployment.setup.warmup_chunks:
-            self._inference.requests.check_measured_poses(answered)
-        self.first_action = answered.commands.intended_start
-        first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
+            self._inference.requests.check_measured_poses(response)
+        self.first_action = response.commands.intended_start
+        first = first_action(self.first_action, np.asarray(response.observation.qpos, np.float64), self._plan)
         self.validated = (_VALIDATED_FAR if first["far"] else _VALIDATED)(
-            rows=len(answered.chunk.actions),
-            ms=answered.seconds * 1000,
+            rows=len(response.chunk.actions),
+            ms=response.seconds * 1000,
             distance=first["distance"],
             joint=first["joint"],
         )
@@ -441,12 +441,12 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
         raise SetupError(_POLICY_WITHOUT_RTC(policy=info.name))
     # The horizon cannot exceed the rows of a response.
     strategy = spec.deployment.strategy
-    wanted, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES
-    if wanted is None or info.horizon is None or "execution_horizon" not in uses:
+    horizon, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES
+    if horizon is None or info.horizon is None or "execution_horizon" not in uses:
         return
     steps = resampling.resampled_length(info.horizon, info.rate or spec.rate, spec.rate)
-    if wanted > steps:
-        raise SetupError(_HORIZON_TOO_LONG(wanted=wanted, policy=info.name, rows=info.horizon, steps=steps))
+    if horizon > steps:
+        raise SetupError(_HORIZON_TOO_LONG(wanted=horizon, policy=info.name, rows=info.horizon, steps=steps))
 
 
 def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:
