@@ -50,11 +50,11 @@ def _to_float32(rows: NDArray[Any]) -> Float32:
         return rows.astype(np.float32)
 
 
-def _two_dimensional(name: str, given: NDArray[Any]) -> NDArray[Any]:
-    if given.ndim == 1:
-        return given[None]
-    if given.ndim == 3 and given.shape[0] == 1:
-        return np.squeeze(given, 0)
-    if given.ndim != 2:
-        raise ShapeError(f"{name} has shape {list(given.shape)}; expected [W], [T, W] or [1, T, W]")
-    return given
+def _two_dimensional(name: str, rows: NDArray[Any]) -> NDArray[Any]:
+    if rows.ndim == 1:
+        return rows[None]
+    if rows.ndim == 3 and rows.shape[0] == 1:
+        return np.squeeze(rows, 0)
+    if rows.ndim != 2:
+        raise ShapeError(f"{name} has shape {list(rows.shape)}; expected [W], [T, W] or [1, T, W]")
+    return rows

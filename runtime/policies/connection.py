@@ -101,19 +101,19 @@ def _addresses(host: str, port: int, seconds: float) -> list[Address]:
 
     They are resolved in a thread, because the system's resolver has no deadline.
     """
-    found: queue.SimpleQueue[list[Address] | OSError] = queue.SimpleQueue()
+    results: queue.SimpleQueue[list[Address] | OSError] = queue.SimpleQueue()
 
     def resolve() -> None:
         try:
-            found.put(list(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
+            results.put(list(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
         except OSError as error:
-            found.put(error)
+            results.put(error)
         except UnicodeError as error:
-            found.put(socket.gaierror(socket.EAI_NONAME, str(error)))
+            results.put(socket.gaierror(socket.EAI_NONAME, str(error)))
 
     threading.Thread(target=resolve, name="resolver", daemon=True).start()
     try:
-        addresses = found.get(timeout=max(0.0, seconds))
+        addresses = results.get(timeout=max(0.0, seconds))
     except queue.Empty as error:
         raise TimeoutError(f"the name {host} was not resolved") from error
     if isinstance(addresses, OSError):

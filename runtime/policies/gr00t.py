@@ -171,18 +171,18 @@ class Gr00tPolicy(Policy):
     def _open(self) -> PolicyInfo:
         left = self._link.open()
         try:
-            wanted = parse_modalities(self._call("get_modality_config", left))
-            self._request.configure(wanted)
-            self._mnp, self._guessed = bool(wanted.reads_mnp), wanted.reads_mnp is None
+            modalities = parse_modalities(self._call("get_modality_config", left))
+            self._request.configure(modalities)
+            self._mnp, self._guessed = bool(modalities.reads_mnp), modalities.reads_mnp is None
         except PolicyError:
             self._link.drop()
             raise
         return PolicyInfo(
-            name="GR00T N1.5" if wanted.is_n15 else "GR00T",
+            name="GR00T N1.5" if modalities.is_n15 else "GR00T",
             action_space=None,
             horizon=self._request.horizon,
             rate=self._config.action_rate,
-            metadata={"modality": wanted.to_dict()},
+            metadata={"modality": modalities.to_dict()},
         )
 
     def _act(self, data: Mapping[str, Any], seconds: float) -> Any:
@@ -240,25 +240,25 @@ class Gr00tPolicy(Policy):
     def _error_text(self, text: str) -> str:
         url = self._config.url
         if text.startswith("Unauthorized"):
-            given = "a wrong one was given" if self._token else "none was given"
+            token_state = "a wrong one was given" if self._token else "none was given"
             return (
-                f"the policy server at {url} wants an API token, {given} ({text}): set policy.api_token_env to the "
-                "name of the environment variable that holds it"
+                f"the policy server at {url} wants an API token, {token_state} ({text}): set policy.api_token_env to "
+                "the name of the environment variable that holds it"
             )
-        said = f"the policy server at {url} reports an error: {error_headline(text)}"
+        message = f"the policy server at {url} reports an error: {error_headline(text)}"
         for pattern, allowed in _HINTS:
             if re.search(pattern, text):
                 return (
-                    f"{said}\nIt wants requests in another form: policy.dialect is {self._config.dialect!r}, see "
+                    f"{message}\nIt wants requests in another form: policy.dialect is {self._config.dialect!r}, see "
                     f"{allowed}"
                 )
         if "must be a numpy array" in text:
             form, mark = ("MNP", "has") if self._mnp else ("NPY", "lacks")
             return (
-                f"{said}\nIt does not read arrays in {form}, although its modality configuration {mark} N1.7's mark: "
-                "it is no version of GR00T's server that is known here"
+                f"{message}\nIt does not read arrays in {form}, although its modality configuration {mark} N1.7's "
+                "mark: it is no version of GR00T's server that is known here"
             )
-        return said
+        return message
 
 
 def _token(config: Config) -> str | None:

@@ -55,20 +55,20 @@ class GripperConvention:
         """Convert the grippers in the rows of a response [T, W] to the robot's values, within the grippers' travel."""
         if not self._converts:
             return rows
-        made = rows.copy()
+        converted = rows.copy()
         for column, gripper in self._columns:
             share = np.clip(rows[:, column], 0.0, 1.0)
-            made[:, column] = self._open[gripper] + share * self._travel[gripper]
-        return made
+            converted[:, column] = self._open[gripper] + share * self._travel[gripper]
+        return converted
 
     def served(self, rows: Float32) -> Float32:
         """Convert the grippers in rows [T, W] from the robot's values back to the server's."""
         if not self._converts:
             return rows
-        made = rows.copy()
+        converted = rows.copy()
         for column, gripper in self._columns:
-            made[:, column] = (rows[:, column] - self._open[gripper]) / self._travel[gripper]
-        return made
+            converted[:, column] = (rows[:, column] - self._open[gripper]) / self._travel[gripper]
+        return converted
 
 
 def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
@@ -77,10 +77,10 @@ def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
     if poses is None:
         return [(dim, gripper) for gripper, dim in enumerate(dims)]
     appended = poses.width - len(poses.dims)
-    each = appended // len(robot.arms)
-    found = [(appended + n, dims.index(dim)) for n, dim in enumerate(poses.dims.tolist()) if dim in dims]
+    arm_width = appended // len(robot.arms)
+    columns = [(appended + n, dims.index(dim)) for n, dim in enumerate(poses.dims.tolist()) if dim in dims]
     if poses.pose.gripper:
         for arm, group in enumerate(robot.arms):
             if group.gripper_dim is not None:
-                found.append((each * arm + each - 1, dims.index(group.gripper_dim)))
-    return found
+                columns.append((arm_width * arm + arm_width - 1, dims.index(group.gripper_dim)))
+    return columns

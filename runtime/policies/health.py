@@ -69,8 +69,8 @@ def _get_status(
     lines = [f"GET {path} HTTP/1.1", f"Host: {place.netloc}", "Connection: close"]
     lines += [f"{name}: {value}" for name, value in headers.items()]
     with contextlib.ExitStack() as stack:
-        there = dial() if dial else (host, port)
-        wire = stack.enter_context(open_connection(url, *there, deadline, seconds, lambda: None))
+        address = dial() if dial else (host, port)
+        wire = stack.enter_context(open_connection(url, *address, deadline, seconds, lambda: None))
         wire.settimeout(_left(deadline))
         if secure:
             wire = stack.enter_context(ssl.create_default_context().wrap_socket(wire, server_hostname=host))

@@ -144,14 +144,14 @@ class LerobotPolicy(Policy):
             if self._ended.is_set():
                 raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
             self._timestep += 1
-            shown = self._request.build(observation, self._timestep)
+            request = self._request.build(observation, self._timestep)
             if not self._link.is_open:
                 self._open()
             seconds = self._config.inference_deadline if self._warm else self._config.first_inference_deadline
             self._warm = self._asked = True
             started = time.monotonic()
             try:
-                answer = self._answer(shown, seconds)
+                answer = self._answer(request, seconds)
             except PolicyDisconnected:
                 self._loaded = False
                 raise
@@ -185,8 +185,8 @@ class LerobotPolicy(Policy):
         try:
             self._link.call(messages.READY, messages.EMPTY, left)
             if not self._loaded:
-                told = messages.encode_setup(self._request.setup_message())
-                self._link.call(messages.INSTRUCT, told, self._config.load_deadline)
+                message = messages.encode_setup(self._request.setup_message())
+                self._link.call(messages.INSTRUCT, message, self._config.load_deadline)
                 self._loaded = True
         except PolicyError as error:
             self._link.drop()
@@ -197,31 +197,31 @@ class LerobotPolicy(Policy):
                 f"{self._config.server_version!r}, allowed: {', '.join(MODULES)}"
             ) from error
 
-    def _answer(self, shown: bytes, seconds: float) -> bytes:
-        """Return the pickled actions for the pickled observation `shown`, which is sent again after an empty response.
+    def _answer(self, request: bytes, seconds: float) -> bytes:
+        """Return the pickled actions for the pickled observation `request`, sent again after an empty response.
 
         A response is empty after a failed inference, and also if a call that we aborted earlier took the observation
         from the server's queue.
         """
-        deadline, pause, asked = time.monotonic() + seconds, _PAUSES[0], 0
+        deadline, pause, attempts = time.monotonic() + seconds, _PAUSES[0], 0
         while True:
             try:
-                data = self._asked_once(shown, deadline)
+                data = self._asked_once(request, deadline)
             except PolicyTimeout as error:
-                if not asked:
+                if not attempts:
                     raise
-                raise self._nothing(asked, seconds) from error
+                raise self._nothing(attempts, seconds) from error
             if data:
                 return data
-            asked += 1
+            attempts += 1
             if time.monotonic() + pause >= deadline:
-                raise self._nothing(asked, seconds)
+                raise self._nothing(attempts, seconds)
             if self._ended.wait(pause):
                 raise PolicyError(f"the connection to {self._config.url} was closed from our side")
             pause = min(2 * pause, _PAUSES[1])
 
-    def _asked_once(self, shown: bytes, deadline: float) -> bytes:
-        self._link.call(messages.OBSERVE, messages.encode_observations(shown), self._left(deadline))
+    def _asked_once(self, request: bytes, deadline: float) -> bytes:
+        self._link.call(messages.OBSERVE, messages.encode_observations(request), self._left(deadline))
         answer = self._link.call(messages.ACT, messages.EMPTY, self._left(deadline))
         try:
             return messages.decode_actions(answer)
@@ -231,13 +231,13 @@ class LerobotPolicy(Policy):
                 f"{self._config.url} sent an answer that is not LeRobot's: {error}"
             ) from error
 
-    def _nothing(self, asked: int, seconds: float) -> PolicyError:
+    def _nothing(self, attempts: int, seconds: float) -> PolicyError:
         self._loaded = False  # it may have restarted without the checkpoint
         self._link.drop()
         return ServerReportedError(
-            f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference fails, which "
-            "it tells its own log alone. What fails most: the model has other images, another number of states, or "
-            "another kind than policy.images, policy.state and policy.policy_type say"
+            f"{self._config.url} answered with nothing, {attempts} times within {seconds:g} s: its inference fails, "
+            "which it tells its own log alone. What fails most: the model has other images, another number of states, "
+            "or another kind than policy.images, policy.state and policy.policy_type say"
         )
 
     def _left(self, deadline: float) -> float:

@@ -48,6 +48,6 @@ class Statistics(Settings):
     def denormalize(self, rows: Float32) -> Float32:
         """Return the robot's values for normalised rows [T, W], which are clipped to -1 .. 1."""
         low, high = np.asarray(self.low), np.asarray(self.high)
-        made = low + (np.clip(rows, -1.0, 1.0) + 1.0) / 2.0 * (high - low)
+        scaled = low + (np.clip(rows, -1.0, 1.0) + 1.0) / 2.0 * (high - low)
         mask = np.ones(len(low), bool) if self.mask is None else np.asarray(self.mask)
-        return np.where(mask, made, rows).astype(np.float32)
+        return np.where(mask, scaled, rows).astype(np.float32)

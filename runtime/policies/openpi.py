@@ -121,9 +121,9 @@ class OpenpiPolicy(WebsocketPolicy):
             PolicyLostError: The server is absent or does not respond. The next call opens another connection.
             PolicyError: The dialect `policy.rtc` cannot carry the conditioning.
         """
-        shown, continued = self.request(observation), self._as_served(conditioning)
+        fields, continued = self.request(observation), self._as_served(conditioning)
         with self._lock:
-            request = msgpack_arrays.pack(self._dialect.wrap(shown, continued))
+            request = msgpack_arrays.pack(self._dialect.wrap(fields, continued))
             self._require_open()
             answer, round_trip = self._exchange(request)
             result = self._result(self._decode(answer, "an answer"))
@@ -165,8 +165,8 @@ class OpenpiPolicy(WebsocketPolicy):
         """
         with contextlib.suppress(CodecError):  # reported by `infer`
             reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)
-            said = _timing(reply).get("server.infer_ms", 0.0) if isinstance(reply, dict) else 0.0
-            if took < _SOONER * said:
+            infer_ms = _timing(reply).get("server.infer_ms", 0.0) if isinstance(reply, dict) else 0.0
+            if took < _SOONER * infer_ms:
                 return "the answer came sooner than the server says that its inference took"
         return super()._mismatch_reason(request, answer, took)
 
@@ -176,16 +176,16 @@ class OpenpiPolicy(WebsocketPolicy):
                 f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
             )
         check_server_claims(reply, self._declared, "answer")
-        given = parse_action_rows("actions", reply["actions"], self._width)
+        rows = parse_action_rows("actions", reply["actions"], self._width)
         own = self._model_rows(reply)
         return ActionChunk(
-            actions=self._grip.to_robot(given if self._scale is None else given * self._scale),
+            actions=self._grip.to_robot(rows if self._scale is None else rows * self._scale),
             space=self._config.action_space,
             rate=self._config.action_rate,
             mode=self._config.action_mode,
             frame=self._config.relative_frame,
             pose=self._config.action_pose,
-            model_actions=given if own is None and self._converts and self._absolute else own,
+            model_actions=rows if own is None and self._converts and self._absolute else own,
             model_relative=False if own is None else self._own_relative,
             timing=_timing(reply) | {"round_trip_ms": round_trip},
         )
@@ -213,19 +213,19 @@ def _check_protocol(metadata: Mapping[str, Any]) -> None:
     """
     kind = next((kind for mark, kind in _MARKS.items() if mark in metadata), None)
     if kind is not None:
-        found = ", ".join(map(str, metadata))
+        keys = ", ".join(map(str, metadata))
         raise WrongProtocolError(
-            f'the server\'s metadata have {found}: it is a server for policy.kind = "{kind}"; correct policy.kind or '
+            f'the server\'s metadata have {keys}: it is a server for policy.kind = "{kind}"; correct policy.kind or '
             "policy.url"
         )
 
 
-def _scale(given: list[float] | None, width: int) -> Float32 | None:
-    if given is not None and len(given) != width:
+def _scale(factors: list[float] | None, width: int) -> Float32 | None:
+    if factors is not None and len(factors) != width:
         raise ConfigurationError(
-            f"policy.action_scale has {len(given)} numbers; the rows of this robot have {width}"
+            f"policy.action_scale has {len(factors)} numbers; the rows of this robot have {width}"
         )
-    return None if given is None else np.array(given, np.float32)
+    return None if factors is None else np.array(factors, np.float32)
 
 
 def _dialect(config: Config) -> Dialect:

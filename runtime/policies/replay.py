@@ -214,8 +214,8 @@ class ReplayPolicy(Policy):
         """Return the index of the row with which the replay continues after a hold."""
         if self._actions is None or self._config.space != "joint":
             return self._row
-        given = self._actions[self._row : self._row + self._config.horizon]
-        away = np.abs(given - observation.qpos).max(axis=1)
+        rows = self._actions[self._row : self._row + self._config.horizon]
+        away = np.abs(rows - observation.qpos).max(axis=1)
         return self._row + int(away.argmin())
 
     def reset(self) -> None:

@@ -110,8 +110,8 @@ class RequestLayout:
     def _picture(self, observation: Observation, camera: str) -> np.ndarray[Any, Any]:
         picture = observation.pictures.get(camera)
         if picture is None:
-            given = ", ".join(observation.pictures) or "none"
-            raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
+            available = ", ".join(observation.pictures) or "none"
+            raise PolicyError(f"the observation has no picture {camera!r}; it has {available}")
         settings = self._settings
         if settings.image_size is not None and settings.resize != "none":
             picture = resize_image(picture, settings.image_size[0], settings.image_size[1], settings.resize)
@@ -137,10 +137,10 @@ def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:
     """
     if settings.cameras is None:
         return None
-    known = [camera.key for camera in robot.cameras]
-    unknown = [key for key in settings.cameras if key not in known]
+    robot_cameras = [camera.key for camera in robot.cameras]
+    unknown = [key for key in settings.cameras if key not in robot_cameras]
     if unknown:
         raise ConfigurationError(
-            f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(known)}"
+            f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(robot_cameras)}"
         )
     return dict(settings.cameras)

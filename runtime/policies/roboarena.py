@@ -168,14 +168,14 @@ class RoboarenaPolicy(WebsocketPolicy):
 def _require_no_error(reply: Any) -> None:
     """Raise ServerReportedError if the reply is an error, which vLLM-Omni sends as a map without disconnecting."""
     if isinstance(reply, Mapping) and reply.get("type") == "error":
-        said = reply.get("message") or reply.get("error") or "nothing more"
-        raise ServerReportedError(f"the policy server reports an error: {said}")
+        text = reply.get("message") or reply.get("error") or "nothing more"
+        raise ServerReportedError(f"the policy server reports an error: {text}")
 
 
 def _short(value: Any) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, Mapping) else repr(value)
-    what = f"a {type(value).__name__}"
-    return f"{what} ({text[:80]})"
+    kind = f"a {type(value).__name__}"
+    return f"{kind} ({text[:80]})"
 
 
 def _new_session() -> str:

@@ -69,88 +69,97 @@ def check_server_claims(said: Mapping[str, Any], declared: DeclaredPolicy, where
     if _COMPARED.isdisjoint(said):  # the case of most responses
         return None
     space = _space(said, declared, where)
-    for key, given, key_here, here in _pairs(said, declared):
-        if given != here:
-            raise _contradiction(where, key, given, f"policy.{key_here}", here)
+    for key, claimed, key_here, own in _pairs(said, declared):
+        if claimed != own:
+            raise _contradiction(where, key, claimed, f"policy.{key_here}", own)
     return space
 
 
-def _pairs(said: Mapping[str, Any], declared: DeclaredPolicy) -> Iterator[tuple[str, Any, str, Any]]:
+def _pairs(claims: Mapping[str, Any], declared: DeclaredPolicy) -> Iterator[tuple[str, Any, str, Any]]:
     """Yield (server's key, its value, deployment's key, its value) for each compared key that the server states."""
-    if said.get("action_dim") is not None:
-        what = "joints" if declared.space == "joint" else f"poses ({declared.pose})"
-        yield "action_dim", said["action_dim"], f"action_space: {what} of this robot, numbers", declared.width
-    if said.get("action_rate") is not None:
-        yield "action_rate", said["action_rate"], "action_rate", declared.rate
-    if said.get("relative_frame") is not None and declared.mode != "absolute":
-        yield "relative_frame", said["relative_frame"], "relative_frame", declared.frame
+    if claims.get("action_dim") is not None:
+        label = "joints" if declared.space == "joint" else f"poses ({declared.pose})"
+        yield (
+            "action_dim",
+            claims["action_dim"],
+            f"action_space: {label} of this robot, numbers",
+            declared.width,
+        )
+    if claims.get("action_rate") is not None:
+        yield "action_rate", claims["action_rate"], "action_rate", declared.rate
+    if claims.get("relative_frame") is not None and declared.mode != "absolute":
+        yield "relative_frame", claims["relative_frame"], "relative_frame", declared.frame
     request = declared.request
     for side, pose, space in (
         ("action", declared.pose, declared.space),
         ("observation", request.observation_pose, request.observation_space),
     ):
         if space == "eef":
-            yield from _pose_pairs(said, side, pose)
+            yield from _pose_pairs(claims, side, pose)
     if request.image_size is not None and request.resize != "none":
         for key in _SIZES:
-            if said.get(key) is not None:
-                yield key, _size(said[key]), "image_size", list(request.image_size)
+            if claims.get(key) is not None:
+                yield key, _size(claims[key]), "image_size", list(request.image_size)
 
 
-def _pose_pairs(said: Mapping[str, Any], side: str, pose: PoseFormat) -> Iterator[tuple[str, Any, str, Any]]:
-    words = [f"{side}_orientation", *(["orientation"] if side == "action" else [])]
-    for key in words:
-        if said.get(key) is not None:
-            here = f"{side}_pose.orientation"
-            yield key, _orientation(said[key], pose.orientation), here, pose.orientation
-    given = said.get(f"{side}_pose")
-    if isinstance(given, Mapping):
+def _pose_pairs(
+    claims: Mapping[str, Any], side: str, pose: PoseFormat
+) -> Iterator[tuple[str, Any, str, Any]]:
+    keys = [f"{side}_orientation", *(["orientation"] if side == "action" else [])]
+    for key in keys:
+        if claims.get(key) is not None:
+            own_key = f"{side}_pose.orientation"
+            yield key, _orientation(claims[key], pose.orientation), own_key, pose.orientation
+    claimed = claims.get(f"{side}_pose")
+    if isinstance(claimed, Mapping):
         for key, value in pose.model_dump().items():
-            if key in given:
-                theirs = _orientation(given[key], value) if key == "orientation" else given[key]
-                yield f"{side}_pose.{key}", theirs, f"{side}_pose.{key}", value
+            if key in claimed:
+                claimed_value = _orientation(claimed[key], value) if key == "orientation" else claimed[key]
+                yield f"{side}_pose.{key}", claimed_value, f"{side}_pose.{key}", value
 
 
-def _orientation(said: object, here: str) -> object:
-    """Return our name for an orientation that the server names `said`; `here` if it is among the possible names."""
-    meant = _ORIENTATIONS.get(str(said).lower(), (said,))
-    return here if here in meant else meant[0]
+def _orientation(claimed: object, own: str) -> object:
+    """Return our name for an orientation that the server names `claimed`; `own` if it is among the possible names."""
+    candidates = _ORIENTATIONS.get(str(claimed).lower(), (claimed,))
+    return own if own in candidates else candidates[0]
 
 
-def _space(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
+def _space(claims: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
     """Return the space that the server names by action_space, or by action_mode, which some servers use for it."""
-    found: Space | None = None
-    for key, words in (("action_space", [*_SPACES]), ("action_mode", [*_SPACES, *_MODES])):
-        given = said.get(key)
-        if given is None:
+    space: Space | None = None
+    for key, allowed in (("action_space", [*_SPACES]), ("action_mode", [*_SPACES, *_MODES])):
+        claimed = claims.get(key)
+        if claimed is None:
             continue
-        if not isinstance(given, str) or given not in words:
-            raise ActionSpaceError(f"the server's {where} has {key} {given!r}; allowed: {', '.join(words)}")
-        if given in _MODES:
-            if given != declared.mode:
-                raise _contradiction(where, key, given, "policy.action_mode", declared.mode)
-            continue
-        found = _SPACES[given]
-        if found != declared.space:
+        if not isinstance(claimed, str) or claimed not in allowed:
             raise ActionSpaceError(
-                f"the server's {where} says that actions are {found!r}, policy.action_space is "
+                f"the server's {where} has {key} {claimed!r}; allowed: {', '.join(allowed)}"
+            )
+        if claimed in _MODES:
+            if claimed != declared.mode:
+                raise _contradiction(where, key, claimed, "policy.action_mode", declared.mode)
+            continue
+        space = _SPACES[claimed]
+        if space != declared.space:
+            raise ActionSpaceError(
+                f"the server's {where} says that actions are {space!r}, policy.action_space is "
                 f"{declared.space!r}; correct the one that is wrong"
             )
-    return found
+    return space
 
 
-def _size(given: Any) -> Any:
+def _size(value: Any) -> Any:
     """Return [height, width] from one number (a square), two numbers, or three numbers with the channels."""
-    if isinstance(given, int | np.integer):
-        return [int(given), int(given)]
-    if isinstance(given, list | tuple | np.ndarray) and len(given) in (2, 3):
-        numbers = np.asarray(given).tolist()
+    if isinstance(value, int | np.integer):
+        return [int(value), int(value)]
+    if isinstance(value, list | tuple | np.ndarray) and len(value) in (2, 3):
+        numbers = np.asarray(value).tolist()
         return numbers[1:] if len(numbers) == 3 and numbers[0] == 3 else numbers[:2]
-    return given
+    return value
 
 
-def _contradiction(where: str, key: str, given: Any, key_here: str, here: Any) -> ContradictionError:
+def _contradiction(where: str, key: str, claimed: Any, key_here: str, own: Any) -> ContradictionError:
     kind = ActionSpaceError if key in _OF_ACTIONS or key.startswith("action_pose") else ContradictionError
     return kind(
-        f"the server's {where} has {key} = {given!r}, {key_here} = {here!r}; correct the one that is wrong"
+        f"the server's {where} has {key} = {claimed!r}, {key_here} = {own!r}; correct the one that is wrong"
     )

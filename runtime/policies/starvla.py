@@ -138,10 +138,10 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def payload(self, observation: Observation) -> dict[str, Any]:
         """Return the content of a request: one example, and the key of the model's statistics if there is one."""
-        shown = self._layout.build(observation)
-        example: dict[str, Any] = {"image": list(shown["images"].values()), "lang": observation.prompt}
+        inputs = self._layout.build(observation)
+        example: dict[str, Any] = {"image": list(inputs["images"].values()), "lang": observation.prompt}
         if self._config.state:
-            example["state"] = shown["state"][None]
+            example["state"] = inputs["state"][None]
         return {"examples": [example]} | ({"unnorm_key": self._unnorm_key} if self._unnorm_key else {})
 
     def _layout_for(self, size: list[int] | None) -> RequestLayout:
@@ -149,11 +149,11 @@ class StarvlaPolicy(WebsocketPolicy):
         return sized.layout(self._robot, {key: key for key in self._config.cameras})
 
     def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
-        said = metadata.get("env")
-        if said not in _ENVIRONMENTS and not {"available_unnorm_keys", "ckpt_path"} & set(metadata):
-            found = ", ".join(map(str, metadata)) or "nothing"
+        environment = metadata.get("env")
+        if environment not in _ENVIRONMENTS and not {"available_unnorm_keys", "ckpt_path"} & set(metadata):
+            keys = ", ".join(map(str, metadata)) or "nothing"
             raise WrongProtocolError(
-                f"the server's metadata have env = {said!r} and {found}; expected env = {_ENVIRONMENTS[0]!r} or "
+                f"the server's metadata have env = {environment!r} and {keys}; expected env = {_ENVIRONMENTS[0]!r} or "
                 f"{_ENVIRONMENTS[1]!r}: it is no StarVLA server; correct policy.kind or policy.url"
             )
         self._unnorm_key = _unnorm_key(metadata, self._config.unnorm_key)
@@ -167,13 +167,13 @@ class StarvlaPolicy(WebsocketPolicy):
             metadata=metadata,
         )
 
-    def _agreed_size(self, said: Any) -> list[int] | None:
+    def _agreed_size(self, claimed: Any) -> list[int] | None:
         """Return height and width of the views. Raises ContradictionError if both sides state different sizes."""
-        trained = _size(said)
+        trained = _size(claimed)
         own = self._config.image_size
         if own is not None and trained is not None and own != trained:
             raise ContradictionError(
-                f"the server's metadata has training_obs_image_size = {said!r}, policy.image_size = {own}; correct "
+                f"the server's metadata has training_obs_image_size = {claimed!r}, policy.image_size = {own}; correct "
                 "the one that is wrong"
             )
         return own or trained
@@ -211,17 +211,17 @@ class StarvlaPolicy(WebsocketPolicy):
         """Raise PolicyError if the reply reports an error, or belongs to another request; then the connection is also
         closed.
         """
-        asked, found = envelope["request_id"], reply.get("request_id")
-        if found != asked:
+        requested_id, answered_id = envelope["request_id"], reply.get("request_id")
+        if answered_id != requested_id:
             self._link.close_gracefully()
             raise WrongProtocolError(
-                f"the answer has request_id {found!r}, asked was {asked!r}: it is another request's, or no StarVLA "
-                "server answers here"
+                f"the answer has request_id {answered_id!r}, asked was {requested_id!r}: it is another "
+                "request's, or no StarVLA server answers here"
             )
         if reply.get("ok") is not True or reply.get("status") != "ok":
             error = reply.get("error")
-            said = error.get("message") if isinstance(error, Mapping) else error
-            raise ServerReportedError(f"the policy server reports an error: {error_headline(str(said))}")
+            message = error.get("message") if isinstance(error, Mapping) else error
+            raise ServerReportedError(f"the policy server reports an error: {error_headline(str(message))}")
 
     def _chunk(self, data: Any, round_trip: float) -> ActionChunk:
         if not isinstance(data, Mapping):
@@ -251,35 +251,35 @@ def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:
     Raises ContradictionError if the server lacks `own`, or has several keys and no default.
     """
     available = metadata.get("available_unnorm_keys")
-    known = [str(key) for key in available] if isinstance(available, list) else []
+    keys = [str(key) for key in available] if isinstance(available, list) else []
     if own is not None:
-        if known and own not in known:
+        if keys and own not in keys:
             raise ContradictionError(
-                f"policy.unnorm_key = {own!r}, the server's metadata has available_unnorm_keys = {', '.join(known)}"
+                f"policy.unnorm_key = {own!r}, the server's metadata has available_unnorm_keys = {', '.join(keys)}"
             )
         return own
     default = metadata.get("default_unnorm_key")
     if isinstance(default, str) and default:
         return default
-    if len(known) > 1:
+    if len(keys) > 1:
         raise ContradictionError(
-            f"the server has statistics of {', '.join(known)} and no default; policy.unnorm_key has to name one"
+            f"the server has statistics of {', '.join(keys)} and no default; policy.unnorm_key has to name one"
         )
-    return known[0] if known else None
+    return keys[0] if keys else None
 
 
-def _size(said: Any) -> list[int] | None:
-    """Return height and width from one number (a square), two numbers, or three with the channels; None if `said` is
+def _size(value: Any) -> list[int] | None:
+    """Return height and width from one number (a square), two numbers, or three with the channels; None if `value` is
     None.
     """
-    if said is None:
+    if value is None:
         return None
-    numbers = [said, said] if type(said) is int else said
+    numbers = [value, value] if type(value) is int else value
     if isinstance(numbers, list) and len(numbers) in (2, 3) and all(type(n) is int for n in numbers):
         sides = numbers[1:] if len(numbers) == 3 and numbers[0] == 3 else numbers[:2]
         if all(side in PIXELS for side in sides):
             return sides
     raise WrongProtocolError(
-        f"the server's metadata have training_obs_image_size = {said!r}; expected height and width, "
+        f"the server's metadata have training_obs_image_size = {value!r}; expected height and width, "
         f"{PIXELS[0]} to {PIXELS[-1]} each"
     )

@@ -168,20 +168,20 @@ class WebsocketPolicy(Policy):
             return _REPEATED
         return ""
 
-    def _decode(self, payload: bytes, what: str) -> dict[str, Any]:
-        message = self._value(payload, what)
+    def _decode(self, payload: bytes, label: str) -> dict[str, Any]:
+        message = self._value(payload, label)
         if not isinstance(message, dict):
             self._link.close_gracefully()
-            raise WrongProtocolError(_NO_MAP(url=self._server.url, what=what, kind=type(message).__name__))
+            raise WrongProtocolError(_NO_MAP(url=self._server.url, what=label, kind=type(message).__name__))
         return message
 
-    def _value(self, payload: bytes, what: str) -> Any:
+    def _value(self, payload: bytes, label: str) -> Any:
         try:
             return msgpack_arrays.unpack(payload, ANSWER_LIMIT)
         except CodecError as error:
             self._link.close_gracefully()
             raise WrongProtocolError(
-                _OTHER_PROTOCOL(url=self._server.url, what=what, protocol=self.PROTOCOL, error=error)
+                _OTHER_PROTOCOL(url=self._server.url, what=label, protocol=self.PROTOCOL, error=error)
             ) from error
 
 

@@ -218,9 +218,9 @@ class WebsocketLink:
         """Send a close frame, without which servers print a traceback, and close, both in a thread of its own."""
         self._watchdog.stop()
         connection, self._connection = self._connection, None
-        held = self._stack.pop_all()
+        resources = self._stack.pop_all()
         if connection is not None:
-            threading.Thread(target=held.close, name=CLOSING).start()
+            threading.Thread(target=resources.close, name=CLOSING).start()
 
     def drop(self) -> None:
         """Close without waiting for the server. Safe to call twice."""
@@ -278,9 +278,11 @@ class WebsocketLink:
                 )
             )
         except TimeoutError as error:
-            found = self._shaking and self._shaking.protocol.handshake_exc
-            if isinstance(found, Exception) and not isinstance(found.__cause__, OSError | EOFError):
-                raise self._foreign(found) from error  # it sent something else and stays connected
+            handshake_error = self._shaking and self._shaking.protocol.handshake_exc
+            if isinstance(handshake_error, Exception) and not isinstance(
+                handshake_error.__cause__, OSError | EOFError
+            ):
+                raise self._foreign(handshake_error) from error  # it sent something else and stays connected
             raise PolicyTimeout(_NO_HANDSHAKE(url=self._url, seconds=self._connect_deadline)) from error
         except InvalidStatus as error:
             raise self._refused(error.response.status_code) from error
@@ -336,21 +338,23 @@ class WebsocketLink:
         if self._connection is not None:
             _end(self._connection.socket)
 
-    def _receive(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> bytes:
-        return self._binary(self._frame(connection, deadline, what, seconds))
+    def _receive(self, connection: ClientConnection, deadline: float, label: str, seconds: float) -> bytes:
+        return self._binary(self._frame(connection, deadline, label, seconds))
 
     def _binary(self, answer: str | bytes) -> bytes:
         if isinstance(answer, str):
             raise ServerReportedError(_SERVER_SAYS(url=self._url, error=error_headline(answer)))
         return answer
 
-    def _frame(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> str | bytes:
+    def _frame(
+        self, connection: ClientConnection, deadline: float, label: str, seconds: float
+    ) -> str | bytes:
         from websockets.exceptions import ConnectionClosed
 
         try:
             return connection.recv(timeout=max(0.0, deadline - time.monotonic()))
         except TimeoutError as error:
-            raise PolicyTimeout(_NOT_IN_TIME(url=self._url, what=what, seconds=seconds)) from error
+            raise PolicyTimeout(_NOT_IN_TIME(url=self._url, what=label, seconds=seconds)) from error
         except ConnectionClosed as error:
             raise self._gone(error) from error
 
@@ -382,11 +386,11 @@ def error_headline(text: str) -> str:
     fields.
     """
     try:
-        said = json.loads(text)
+        fields = json.loads(text)
     except (ValueError, RecursionError):
-        said = None
-    if isinstance(said, dict):
-        words = [str(said[key]) for key in ("error", "message", "code") if said.get(key)]
-        text = ", ".join(words) or text
+        fields = None
+    if isinstance(fields, dict):
+        texts = [str(fields[key]) for key in ("error", "message", "code") if fields.get(key)]
+        text = ", ".join(texts) or text
     lines = text.strip().splitlines() or ["(an empty text)"]
     return lines[-1] if len(lines) == 1 else f"{lines[-1].strip()}\n{text.strip()}"

@@ -109,9 +109,9 @@ class ArenaActions:
             return reply
         missing = [name for name in self._parts if name not in reply]
         if missing or not self._parts:
-            found = ", ".join(map(str, reply)) or "nothing"
+            keys = ", ".join(map(str, reply)) or "nothing"
             raise ShapeError(
-                f"the answer has no 'actions' but {found}; allowed: an array, a map with 'actions', or parts named "
+                f"the answer has no 'actions' but {keys}; allowed: an array, a map with 'actions', or parts named "
                 f"in policy.action_keys ({', '.join(self._parts) or 'none'})"
             )
         parts = [parse_action_rows(name, reply[name]) for name in self._parts]

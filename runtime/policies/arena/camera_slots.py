@@ -27,11 +27,11 @@ class Cameras:
     """
 
     def __init__(self, cameras: Mapping[str, Slot], numbering: Numbering, robot: Robot) -> None:
-        known = [camera.key for camera in robot.cameras]
-        unknown = [key for key in cameras if key not in known]
+        robot_cameras = [camera.key for camera in robot.cameras]
+        unknown = [key for key in cameras if key not in robot_cameras]
         if unknown:
             raise ConfigurationError(
-                f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(known)}"
+                f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(robot_cameras)}"
             )
         self._by_slot = {slot: key for key, slot in cameras.items()}
         if len(self._by_slot) != len(cameras):
@@ -45,7 +45,7 @@ class Cameras:
 
         Cameras for other views are not sent. Raises ContradictionError if no camera is declared for a needed view.
         """
-        found: dict[str, str] = {}
+        assigned: dict[str, str] = {}
         for slot, key in _keys(wants, self._numbering):
             if slot not in self._by_slot:
                 declared = ", ".join(f"{k} = {s}" for s, k in self._by_slot.items()) or "none"
@@ -54,8 +54,8 @@ class Cameras:
                     f"{wants.wrist}, needs_stereo_camera = {wants.stereo}), policy.cameras has no {slot!r}, only "
                     f"{declared}; say which camera it is"
                 )
-            found[key] = self._by_slot[slot]
-        return found
+            assigned[key] = self._by_slot[slot]
+        return assigned
 
 
 def _keys(wants: ServerRequirements, numbering: Numbering) -> list[tuple[Slot, str]]:

@@ -43,10 +43,10 @@ class History:
         """
         self.add(observation)
         with self._lock:
-            seen = [one for one in self._kept if one[0] < observation.arrived]
-        seen.append((observation.arrived, observation.pictures))
+            stored = [frame for frame in self._kept if frame[0] < observation.arrived]
+        stored.append((observation.arrived, observation.pictures))
         moments = (observation.arrived - step / self._rate for step in self._steps)
-        return [min(seen, key=lambda one: abs(one[0] - moment))[1] for moment in moments]
+        return [min(stored, key=lambda frame: abs(frame[0] - moment))[1] for moment in moments]
 
     def reset(self) -> None:
         """Drop all pictures."""

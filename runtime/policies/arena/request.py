@@ -155,8 +155,8 @@ class ArenaRequest:
         newest = self._seen[-1]
         if self._settings.frames == 1 or first:
             return dict(newest)
-        shown = [self._seen[0]] * (self._settings.frames - len(self._seen)) + list(self._seen)
-        return {key: np.stack([pictures[key] for pictures in shown]) for key in newest}
+        frames = [self._seen[0]] * (self._settings.frames - len(self._seen)) + list(self._seen)
+        return {key: np.stack([pictures[key] for pictures in frames]) for key in newest}
 
     def _of_moments(self, moments: Sequence[Mapping[str, UInt8]]) -> dict[str, UInt8]:
         views = [self._views(pictures) for pictures in moments]
@@ -168,8 +168,8 @@ class ArenaRequest:
     def _picture(self, pictures: Mapping[str, UInt8], camera: str) -> UInt8:
         picture = pictures.get(camera)
         if picture is None:
-            given = ", ".join(pictures) or "none"
-            raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
+            available = ", ".join(pictures) or "none"
+            raise PolicyError(f"the observation has no picture {camera!r}; it has {available}")
         if self._settings.resize == "droid":
             picture = resize_image(picture, *_FIELD_SIZE, "stretch", "lanczos")
             return picture if self._size is None else resize_image(picture, *self._size, "stretch", "lanczos")
@@ -179,9 +179,9 @@ class ArenaRequest:
         if self._poses is None:
             return np.zeros(6 * max(1, self._arms), np.float32)
         if observation.eef is None or observation.eef.size != EEF_WIDTH * self._arms:
-            given = 0 if observation.eef is None else observation.eef.size
+            size = 0 if observation.eef is None else observation.eef.size
             raise PolicyError(
-                f"the observation has {given} numbers of poses; expected {EEF_WIDTH * self._arms}, or allowed: "
+                f"the observation has {size} numbers of poses; expected {EEF_WIDTH * self._arms}, or allowed: "
                 'policy.cartesian_position = "zeros"'
             )
         vectors = observation.eef.astype(np.float64).reshape(1, -1, EEF_WIDTH)

@@ -46,9 +46,9 @@ def parse_requirements(metadata: Mapping[str, Any]) -> ServerRequirements:
     Raises PolicyError, whose message names the wrong key.
     """
     if not any(name in metadata for name in _FIELDS):
-        found = ", ".join(map(str, metadata)) or "nothing"
+        keys = ", ".join(map(str, metadata)) or "nothing"
         raise WrongProtocolError(
-            f"the server's metadata have none of {', '.join(_FIELDS)}, but {found}: it is no server of the "
+            f"the server's metadata have none of {', '.join(_FIELDS)}, but {keys}: it is no server of the "
             'RoboArena family; correct policy.kind (a plain openpi server: "openpi") or policy.url'
         )
     parts = metadata.get("action_keys")
@@ -65,44 +65,44 @@ def parse_requirements(metadata: Mapping[str, Any]) -> ServerRequirements:
     )
 
 
-def _resolution(given: Any) -> tuple[int, int] | None:
-    if given is None:
+def _resolution(value: Any) -> tuple[int, int] | None:
+    if value is None:
         return None
-    if isinstance(given, list) and len(given) == 2 and all(type(n) is int and n in _PIXELS for n in given):
-        return given[0], given[1]
-    raise _wrong("image_resolution", given, "[height, width] from 1 to 4096 each, or nil")
+    if isinstance(value, list) and len(value) == 2 and all(type(n) is int and n in _PIXELS for n in value):
+        return value[0], value[1]
+    raise _wrong("image_resolution", value, "[height, width] from 1 to 4096 each, or nil")
 
 
-def _externals(given: Any) -> int:
-    if type(given) is int and 0 <= given <= 2:
-        return given
-    raise _wrong("n_external_cameras", given, "0, 1 or 2")
+def _externals(value: Any) -> int:
+    if type(value) is int and 0 <= value <= 2:
+        return value
+    raise _wrong("n_external_cameras", value, "0, 1 or 2")
 
 
 def _flag(metadata: Mapping[str, Any], name: str, default: bool) -> bool:
-    given = metadata.get(name, default)
-    if isinstance(given, bool):
-        return given
-    raise _wrong(name, given, "true or false")
+    value = metadata.get(name, default)
+    if isinstance(value, bool):
+        return value
+    raise _wrong(name, value, "true or false")
 
 
-def _space(given: Any) -> ActionSpace:
+def _space(value: Any) -> ActionSpace:
     for space in SPACES:
-        if given == space:
+        if value == space:
             return space
-    raise ActionSpaceError(_unknown("action_space", given, ", ".join(SPACES)))
+    raise ActionSpaceError(_unknown("action_space", value, ", ".join(SPACES)))
 
 
 def _positive(metadata: Mapping[str, Any], name: str) -> int | None:
-    given = metadata.get(name)
-    if given is None or (type(given) is int and given > 0):
-        return given
-    raise _wrong(name, given, "a whole number above 0")
+    value = metadata.get(name)
+    if value is None or (type(value) is int and value > 0):
+        return value
+    raise _wrong(name, value, "a whole number above 0")
 
 
-def _wrong(name: str, given: Any, allowed: str) -> PolicyError:
-    return WrongProtocolError(_unknown(name, given, allowed))
+def _wrong(name: str, value: Any, allowed: str) -> PolicyError:
+    return WrongProtocolError(_unknown(name, value, allowed))
 
 
-def _unknown(name: str, given: Any, allowed: str) -> str:
-    return f"the server's metadata have {name} = {given!r}; allowed: {allowed}"
+def _unknown(name: str, value: Any, allowed: str) -> str:
+    return f"the server's metadata have {name} = {value!r}; allowed: {allowed}"

@@ -121,9 +121,9 @@ class Channel:
         code, details = error.code(), str(error.details())
         codes, name = _grpc().StatusCode, method.rpartition("/")[2]
         if code is codes.UNKNOWN:  # the server's own code failed; it continues to serve
-            said = details.removeprefix("Exception calling application: ")
+            text = details.removeprefix("Exception calling application: ")
             return ServerReportedError(
-                f"the policy server at {self._url} reports an error in {name}: {error_headline(said)}"
+                f"the policy server at {self._url} reports an error in {name}: {error_headline(text)}"
             )
         self.drop()
         if self._aborted:

@@ -65,16 +65,16 @@ def load_actions(data: bytes, limit: int) -> list[TimedAction]:
     if len(data) > limit:
         raise CodecError(f"actions of {len(data)} bytes exceed the limit of {limit}")
     try:
-        given = _Reader(io.BytesIO(data)).load()
+        actions = _Reader(io.BytesIO(data)).load()
     except CodecError:
         raise
     except Exception as error:  # a broken pickle may raise any exception, but has executed nothing
         raise CodecError(
             f"{len(data)} bytes are no pickle of actions: {type(error).__name__}: {error}"
         ) from error
-    if not isinstance(given, list):
-        raise CodecError(f"the actions are {type(given).__name__}; expected a list of TimedAction")
-    return [_timed_action(one) for one in given]
+    if not isinstance(actions, list):
+        raise CodecError(f"the actions are {type(actions).__name__}; expected a list of TimedAction")
+    return [_timed_action(action) for action in actions]
 
 
 class _Writer(pickle._Pickler):
@@ -114,8 +114,8 @@ class _Name:
     what: str
     make: Callable[..., Any] | None
 
-    def __init__(self, what: str, make: Callable[..., Any] | None) -> None:
-        object.__setattr__(self, "what", what)
+    def __init__(self, name: str, make: Callable[..., Any] | None) -> None:
+        object.__setattr__(self, "what", name)
         object.__setattr__(self, "make", make)
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -151,20 +151,20 @@ class _Reader(Reader):
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file)
         tensors = Tensors(Reader)
-        known: dict[tuple[str, str], Callable[..., Any] | None] = {
+        constructors: dict[tuple[str, str], Callable[..., Any] | None] = {
             ("torch._utils", "_rebuild_tensor_v2"): tensors.tensor,
             ("torch.storage", "_load_from_bytes"): tensors.storage,
             ("collections", "OrderedDict"): dict,
             **{(module, "TimedAction"): None for module in MODULES.values()},
         }
-        self._names = {key: _Name(".".join(key), make) for key, make in known.items()}
+        self._names = {key: _Name(".".join(key), make) for key, make in constructors.items()}
 
     def find_class(self, module: str, name: str) -> Any:
-        found = self._names.get((module, name))
-        if found is None:
-            allowed = ", ".join(sorted(one.what for one in self._names.values()))
+        result = self._names.get((module, name))
+        if result is None:
+            allowed = ", ".join(sorted(entry.what for entry in self._names.values()))
             raise CodecError(f"a pickle that names {module}.{name} is refused; allowed: {allowed}")
-        return found
+        return result
 
     def _reduce(self) -> None:
         arguments = self.stack.pop()
@@ -182,10 +182,10 @@ class _Reader(Reader):
 
     def _build(self) -> None:
         state = self.stack.pop()
-        made = self.stack[-1]
-        if not isinstance(made, _Record) or type(state) is not dict:
-            raise CodecError(f"a pickle that changes {type(made).__name__} is refused")
-        made.fields = state
+        record = self.stack[-1]
+        if not isinstance(record, _Record) or type(state) is not dict:
+            raise CodecError(f"a pickle that changes {type(record).__name__} is refused")
+        record.fields = state
 
     # These replace the instructions that call, create or change objects.
     dispatch[pickle.REDUCE[0]] = _reduce
@@ -193,10 +193,10 @@ class _Reader(Reader):
     dispatch[pickle.BUILD[0]] = _build
 
 
-def _timed_action(given: object) -> TimedAction:
-    fields = given.fields if isinstance(given, _Record) else {}
+def _timed_action(element: object) -> TimedAction:
+    fields = element.fields if isinstance(element, _Record) else {}
     timestamp, timestep, action = (fields.get(name) for name in ("timestamp", "timestep", "action"))
     if type(timestamp) is not float or type(timestep) is not int or not isinstance(action, np.ndarray):
-        found = {str(name): type(value).__name__ for name, value in fields.items()} or type(given).__name__
-        raise CodecError(f"an action is {found}; expected timestamp float, timestep int, action tensor")
+        types = {str(name): type(value).__name__ for name, value in fields.items()} or type(element).__name__
+        raise CodecError(f"an action is {types}; expected timestamp float, timestep int, action tensor")
     return TimedAction(timestamp, timestep, action)

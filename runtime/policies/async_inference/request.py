@@ -79,8 +79,8 @@ class AsyncRequest:
         poses = pose_rows_for(
             settings.observation_space, settings.observation_pose, robot, "observation_pose"
         )
-        ours = robot.joint_names if poses is None else poses.names
-        self._names = _names(settings.state_names, [f"{ours[place]}.pos" for place in self._places])
+        own_names = robot.joint_names if poses is None else poses.names
+        self._names = _names(settings.state_names, [f"{own_names[place]}.pos" for place in self._places])
         self._layout = settings.layout(robot, {camera: camera for camera in settings.images.values()})
 
     def setup_message(self) -> bytes:
@@ -108,11 +108,11 @@ class AsyncRequest:
 
     def build(self, observation: Observation, timestep: int) -> bytes:
         """Return the pickle of an observation with `must_go` set. Raises PolicyError if a part is missing."""
-        shown = self._layout.build(self._grip.convert_observation(observation))
+        inputs = self._layout.build(self._grip.convert_observation(observation))
         values: dict[str, Any] = {
-            name: float(shown["state"][place]) for name, place in zip(self._names, self._places, strict=True)
+            name: float(inputs["state"][place]) for name, place in zip(self._names, self._places, strict=True)
         }
-        values |= {name: shown["images"][camera] for name, camera in self._settings.images.items()}
+        values |= {name: inputs["images"][camera] for name, camera in self._settings.images.items()}
         values["task"] = observation.prompt
         return dump(TimedObservation(time.time(), timestep, values, must_go=True), self._module)
 
@@ -123,8 +123,8 @@ class AsyncRequest:
             PolicyError: The response belongs to another observation, has gaps, or its rows are invalid.
             ContradictionError: The rows are for another rate.
         """
-        actions = sorted(given, key=lambda one: one.timestep)
-        steps = [one.timestep for one in actions]
+        actions = sorted(given, key=lambda action: action.timestep)
+        steps = [action.timestep for action in actions]
         if not actions:
             raise ShapeError("the answer has no actions")
         if steps != list(range(timestep, timestep + len(steps))):
@@ -132,17 +132,19 @@ class AsyncRequest:
                 f"the answer has actions for the steps {_short(steps)}; expected {timestep} and those after it, as it "
                 "answers the observation of that step: another client uses the same server?"
             )
-        self._check_rate([one.timestamp for one in actions])
-        for one in actions:
-            if one.action.ndim != 1 or one.action.shape != actions[0].action.shape:
+        self._check_rate([action.timestamp for action in actions])
+        for action in actions:
+            if action.action.ndim != 1 or action.action.shape != actions[0].action.shape:
                 raise ShapeError(
-                    f"the action for step {one.timestep} has shape {list(one.action.shape)}, the first "
+                    f"the action for step {action.timestep} has shape {list(action.action.shape)}, the first "
                     f"{list(actions[0].action.shape)}; expected [{self._row_width}] each"
                 )
-        rows = parse_action_rows("the answer", np.stack([one.action for one in actions]), self._row_width)
-        made = np.empty_like(rows)
-        made[:, self._actions] = rows
-        return self._grip.to_robot(made)
+        rows = parse_action_rows(
+            "the answer", np.stack([action.action for action in actions]), self._row_width
+        )
+        robot_rows = np.empty_like(rows)
+        robot_rows[:, self._actions] = rows
+        return self._grip.to_robot(robot_rows)
 
     def _check_rate(self, times: Sequence[float]) -> None:
         """Check the rate by the rows' timestamps, which the server computes from the rate that it was started with."""
@@ -150,29 +152,30 @@ class AsyncRequest:
             return
         apart = (times[-1] - times[0]) / (len(times) - 1)
         if not abs(apart * self._rate - 1.0) <= _RATE_TOLERANCE:
-            said = f"{1.0 / apart:.4g} Hz" if apart > 0 else f"{apart:g} s apart"
+            text = f"{1.0 / apart:.4g} Hz" if apart > 0 else f"{apart:g} s apart"
             raise ContradictionError(
-                f"the server's rows are at {said}, policy.action_rate (without it the control rate) is {self._rate:g} "
+                f"the server's rows are at {text}, policy.action_rate (without it the control rate) is {self._rate:g} "
                 "Hz; start it with --fps of that rate, or correct policy.action_rate"
             )
 
 
-def _places(name: str, given: Sequence[int] | None, width: int) -> list[int]:
-    places = list(range(width)) if given is None else list(given)
+def _places(name: str, requested: Sequence[int] | None, width: int) -> list[int]:
+    places = list(range(width)) if requested is None else list(requested)
     if max(places) >= width:
         raise ConfigurationError(f"policy.{name} = {places} leaves the vector; allowed: 0 to {width - 1}")
     return places
 
 
-def _names(given: Sequence[str] | None, ours: list[str]) -> list[str]:
-    names = ours if given is None else list(given)
-    if len(names) != len(ours) or len(set(names)) != len(names):
+def _names(requested: Sequence[str] | None, own_names: list[str]) -> list[str]:
+    names = own_names if requested is None else list(requested)
+    if len(names) != len(own_names) or len(set(names)) != len(names):
         raise ConfigurationError(
-            f"policy.state_names has {len(names)} names, {len(set(names))} different ones; the state has {len(ours)}"
+            f"policy.state_names has {len(names)} names, {len(set(names))} different ones; "
+            f"the state has {len(own_names)}"
         )
     return names
 
 
 def _short(steps: Sequence[int]) -> str:
-    shown = ", ".join(map(str, steps[:4]))
-    return f"{shown}, ... {steps[-1]}" if len(steps) > 4 else shown
+    beginning = ", ".join(map(str, steps[:4]))
+    return f"{beginning}, ... {steps[-1]}" if len(steps) > 4 else beginning

@@ -78,14 +78,19 @@ class Tensors:
 
     def _read(self, data: bytes) -> Array:
         file = io.BytesIO(data)
-        magic, version, machine, said, keys = (self._reader(file).load() for _ in range(5))
+        magic, version, machine, storage, keys = (self._reader(file).load() for _ in range(5))
         if (magic, version) != (_MAGIC, _VERSION) or not isinstance(machine, dict):
             raise CodecError("a storage does not begin as torch's do")
         if machine.get("little_endian") is not True:
             raise CodecError("a storage was written by a big-endian machine")
-        if type(said) is not tuple or len(said) != 6 or said[0] != "storage" or said[1] not in _KINDS:
-            raise CodecError(f"a storage says that it is {str(said)[:80]}")
-        kind, key, count, view = said[1], said[2], said[4], said[5]
+        if (
+            type(storage) is not tuple
+            or len(storage) != 6
+            or storage[0] != "storage"
+            or storage[1] not in _KINDS
+        ):
+            raise CodecError(f"a storage says that it is {str(storage)[:80]}")
+        kind, key, count, view = storage[1], storage[2], storage[4], storage[5]
         counted, raw = file.read(8), file.read()
         dtype = np.dtype(_KINDS[kind])
         whole = len(counted) == 8 and type(count) is int and struct.unpack("<q", counted)[0] == count

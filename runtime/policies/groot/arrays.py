@@ -113,12 +113,12 @@ def _from_npy(data: object) -> np.ndarray[Any, Any]:
     if not start or len(data) < start:
         raise CodecError(f"a .npy file begins with {data[:12]!r}; allowed: version 1 or 2 of the format")
     end = start + struct.unpack_from(length, data, 8)[0]
-    found = _HEADER.fullmatch(data[start:end].decode("latin-1"))
-    if found is None:
+    match = _HEADER.fullmatch(data[start:end].decode("latin-1"))
+    if match is None:
         raise CodecError(
             f"a .npy file has the header {data[start:end][:80]!r}; expected one array of a plain type"
         )
-    descr, fortran, numbers = found.groups()
+    descr, fortran, numbers = match.groups()
     shape = [int(number) for number in numbers.replace(",", " ").split()]
     return _array(descr, shape, data[end:], "F" if fortran == "True" else "C")
 

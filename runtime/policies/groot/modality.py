@@ -63,8 +63,11 @@ class Modalities:
         """Return the modalities as they are written to a recording's manifest."""
         if self.contract is not None:
             return dict(self.contract)
-        each = {name: getattr(self, name) for name in _NAMES}
-        return {name: {"keys": list(one.keys or ()), "steps": list(one.steps)} for name, one in each.items()}
+        by_name = {name: getattr(self, name) for name in _NAMES}
+        return {
+            name: {"keys": list(modality.keys or ()), "steps": list(modality.steps)}
+            for name, modality in by_name.items()
+        }
 
 
 def parse_modalities(reply: object) -> Modalities:
@@ -79,39 +82,39 @@ def parse_modalities(reply: object) -> Modalities:
         raise WrongProtocolError(
             f"the answer to get_modality_config is {_short(reply)}; expected a map of {', '.join(_NAMES)}"
         )
-    given = {name: _marked(reply[name], name) for name in _NAMES if name in reply}
+    fields = {name: _marked(reply[name], name) for name in _NAMES if name in reply}
     video, state, action, language = (
-        _modality(given[name], name) if name in given else Modality() for name in _NAMES
+        _modality(fields[name], name) if name in fields else Modality() for name in _NAMES
     )
-    newest = any(_NEWEST in one for one in given.values())
-    texts = any(isinstance(one.get("as_json"), str) for one in given.values())  # the form of N1.5
-    marked = any(mark in one for one in given.values() for mark in _MARKS)
+    newest = any(_NEWEST in entry for entry in fields.values())
+    texts = any(isinstance(entry.get("as_json"), str) for entry in fields.values())  # the form of N1.5
+    marked = any(mark in entry for entry in fields.values() for mark in _MARKS)
     return Modalities(video, state, action, language, texts and not newest, newest if marked else None)
 
 
-def _contract(given: Mapping[str, Any]) -> Modalities:
+def _contract(contract: Mapping[str, Any]) -> Modalities:
     """Return modalities from flat lists of keys; everything that the server does not state follows the deployment."""
-    horizon: Any = given.get("action_horizon")
+    horizon: Any = contract.get("action_horizon")
     rows = horizon if type(horizon) is int and 0 < horizon <= _MOST_ROWS else 1
     return Modalities(
-        Modality(_flat(given, "video")),
-        Modality(_flat(given, "state"), widths=_widths(given, "state")),
-        Modality(_flat(given, "action"), tuple(range(rows)), widths=_widths(given, "action")),
+        Modality(_flat(contract, "video")),
+        Modality(_flat(contract, "state"), widths=_widths(contract, "state")),
+        Modality(_flat(contract, "action"), tuple(range(rows)), widths=_widths(contract, "action")),
         Modality(None),
-        contract=given,
+        contract=contract,
     )
 
 
-def _flat(given: Mapping[str, Any], name: Name) -> tuple[str, ...] | None:
+def _flat(contract: Mapping[str, Any], name: Name) -> tuple[str, ...] | None:
     """Return the keys of a modality without their prefix; None if it has none, because the model does not use it."""
-    keys = given.get(f"{name}_keys", [])
+    keys = contract.get(f"{name}_keys", [])
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise WrongProtocolError(f"the server has {name}_keys {_short(keys)}; expected a list of names")
     return tuple(key.removeprefix(f"{name}.") for key in keys) or None
 
 
-def _widths(given: Mapping[str, Any], name: Name) -> dict[str, int]:
-    widths = given.get(f"{name}_key_dims", {})
+def _widths(contract: Mapping[str, Any], name: Name) -> dict[str, int]:
+    widths = contract.get(f"{name}_key_dims", {})
     if not isinstance(widths, Mapping) or not all(type(width) is int for width in widths.values()):
         raise WrongProtocolError(
             f"the server has {name}_key_dims {_short(widths)}; expected a number by name"
@@ -119,16 +122,16 @@ def _widths(given: Mapping[str, Any], name: Name) -> dict[str, int]:
     return {str(key).removeprefix(f"{name}."): width for key, width in widths.items()}
 
 
-def _marked(given: Any, name: Name) -> Mapping[str, Any]:
-    if not isinstance(given, Mapping) or not any(key in given for key in (*_MARKS, *_FIELDS)):
+def _marked(value: Any, name: Name) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping) or not any(key in value for key in (*_MARKS, *_FIELDS)):
         raise WrongProtocolError(
-            f"the server's modality {name!r} is {_short(given)}; expected a modality configuration"
+            f"the server's modality {name!r} is {_short(value)}; expected a modality configuration"
         )
-    return given
+    return value
 
 
-def _modality(given: Mapping[str, Any], name: Name) -> Modality:
-    fields = given.get("as_json", given)
+def _modality(entry: Mapping[str, Any], name: Name) -> Modality:
+    fields = entry.get("as_json", entry)
     if isinstance(fields, str):
         try:
             fields = json.loads(fields)
@@ -164,9 +167,9 @@ def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
     }
 
 
-def _enum_name(given: object) -> str:
+def _enum_name(value: object) -> str:
     """Return the name of an enumeration member, which servers state by its name or its value."""
-    return str(given).upper().replace("+", "_")
+    return str(value).upper().replace("+", "_")
 
 
 def join_names(names: Iterable[str]) -> str:

@@ -62,7 +62,7 @@ class ReqLink:
         self._require_not_aborted()
         place = self._place()
         self._probe(place, deadline)
-        made: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
+        connection: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
         for option, value in (
             (zmq.LINGER, 0),
             (zmq.MAXMSGSIZE, self._limit),
@@ -75,10 +75,10 @@ class ReqLink:
                 -1,
             ),  # with the connection the request is lost, so the socket must be replaced, too
         ):
-            made.setsockopt(option, value)
-        self._socket, self._monitor = made, made.get_monitor_socket(_WATCHED)
+            connection.setsockopt(option, value)
+        self._socket, self._monitor = connection, connection.get_monitor_socket(_WATCHED)
         with self._dropping_on_error():
-            made.connect(
+            connection.connect(
                 f"tcp://[{place[0]}]:{place[1]}" if ":" in place[0] else f"tcp://{place[0]}:{place[1]}"
             )
             self._handshake(deadline)
@@ -158,8 +158,8 @@ class ReqLink:
             raise PolicyLostError(f"the connection to {self._url} failed ({error})") from error
 
     def _greeting(self, wire: socket.socket, deadline: float) -> bytes:
-        said = b""
-        while len(said) < len(_SIGNATURE):
+        greeting = b""
+        while len(greeting) < len(_SIGNATURE):
             self._require_not_aborted()
             if time.monotonic() >= deadline:
                 raise TimeoutError("no greeting")
@@ -167,28 +167,28 @@ class ReqLink:
                 more = wire.recv(64)
                 if not more:
                     break
-                said += more
-        return said
+                greeting += more
+        return greeting
 
-    def _require_zmq(self, said: bytes) -> None:
-        if not said:
+    def _require_zmq(self, greeting: bytes) -> None:
+        if not greeting:
             raise PolicyLostError(
                 f"{self._url} closed the connection at once: see that the policy server runs, and check "
                 "host, port and policy.kind: a server of another kind hangs up too"
             )
-        if said[0] != 0xFF or len(said) < len(_SIGNATURE) or said[9] != 0x7F:
+        if greeting[0] != 0xFF or len(greeting) < len(_SIGNATURE) or greeting[9] != 0x7F:
             raise WrongProtocolError(
-                f"the server at {self._url} does not speak ZMQ (it answers {said[:40]!r}): "
+                f"the server at {self._url} does not speak ZMQ (it answers {greeting[:40]!r}): "
                 "check host, port and policy.kind"
             )
 
     def _handshake(self, deadline: float) -> None:
         while True:
             self._require_not_aborted()
-            heard = self._poll_events(_SPELL_MS)
-            if heard & zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            events = self._poll_events(_SPELL_MS)
+            if events & zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 return
-            if heard:  # failed, or the peer closed in the middle, as it does if socket types do not match
+            if events:  # failed, or the peer closed in the middle, as it does if socket types do not match
                 raise WrongProtocolError(
                     f"{self._url} speaks ZMQ but takes no requests (its socket is no REP socket, or it wants keys): "
                     "the port of an execution node, perhaps; correct policy.url"

@@ -112,8 +112,12 @@ class Gr00tRequest:
         for key in settings.actions:
             _check_written(key, wanted.action.written.get(key), settings)
         self._language = _language_key(wanted.language, settings.language_key)
-        for name, one in (("video", wanted.video), ("state", wanted.state), ("language", wanted.language)):
-            _check_steps(name, one, settings.history)
+        for name, modality in (
+            ("video", wanted.video),
+            ("state", wanted.state),
+            ("language", wanted.language),
+        ):
+            _check_steps(name, modality, settings.history)
         self._wanted = wanted
 
     @property
@@ -128,22 +132,28 @@ class Gr00tRequest:
 
     def model_input(self, observation: Observation) -> ModelInput:
         """Return the pictures and the state of an observation. Raises PolicyError if a part is missing."""
-        shown = self._layout.build(self._grip.convert_observation(observation))
-        pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
-        return ModelInput(observation.step, pictures, shown["state"])
+        inputs = self._layout.build(self._grip.convert_observation(observation))
+        pictures = {key: inputs["images"][camera] for key, camera in self._settings.video.items()}
+        return ModelInput(observation.step, pictures, inputs["state"])
 
     def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
         """Return the arguments of get_action for the newest input `moment` and the stored inputs before it.
 
         `moment` is stored as long as later requests need it.
         """
-        wanted = self._wanted
-        assert wanted is not None, "configure comes first"
+        modalities = self._wanted
+        assert modalities is not None, "configure comes first"
         self._remember(moment)
         settings = self._settings
-        seen, felt = self._nearest_inputs(wanted.video.steps), self._nearest_inputs(wanted.state.steps)
-        video = {key: np.stack([one.pictures[key] for one in seen]) for key in settings.video}
-        states = np.stack([one.state for one in felt])
+        video_inputs, felt = (
+            self._nearest_inputs(modalities.video.steps),
+            self._nearest_inputs(modalities.state.steps),
+        )
+        video = {
+            key: np.stack([model_input.pictures[key] for model_input in video_inputs])
+            for key in settings.video
+        }
+        states = np.stack([model_input.state for model_input in felt])
         state = {key: np.ascontiguousarray(states[:, dims]) for key, dims in settings.state.items()}
         if settings.dialect == "n1.5":
             return _prefixed("video", video) | _prefixed("state", state) | {self._language: [prompt]}
@@ -152,7 +162,7 @@ class Gr00tRequest:
         if settings.dialect == "sim_wrapper":
             flat = _prefixed("video", batches) | _prefixed("state", vectors) | {self._language: [prompt]}
             return {"observation": flat, "options": None}
-        spoken = {self._language: [[prompt] * len(wanted.language.steps)]}
+        spoken = {self._language: [[prompt] * len(modalities.language.steps)]}
         return {"observation": {"video": batches, "state": vectors, "language": spoken}, "options": None}
 
     def rows(self, reply: object) -> Float32:
@@ -164,12 +174,12 @@ class Gr00tRequest:
         parts = {key: self._part(answer, key, dims) for key, dims in self._settings.actions.items()}
         heights = {key: len(part) for key, part in parts.items()}
         if len(set(heights.values())) != 1:
-            told = ", ".join(f"{key} {height}" for key, height in heights.items())
-            raise ShapeError(f"the parts of the answer have different numbers of rows: {told}")
-        made = np.empty((next(iter(heights.values())), self._row_width), np.float32)
+            listing = ", ".join(f"{key} {height}" for key, height in heights.items())
+            raise ShapeError(f"the parts of the answer have different numbers of rows: {listing}")
+        robot_rows = np.empty((next(iter(heights.values())), self._row_width), np.float32)
         for key, part in parts.items():
-            made[:, self._settings.actions[key]] = part
-        return self._grip.to_robot(made)
+            robot_rows[:, self._settings.actions[key]] = part
+        return self._grip.to_robot(robot_rows)
 
     def _answer(self, reply: object) -> Mapping[str, Any]:
         early = self._settings.dialect == "n1.5"
@@ -185,25 +195,25 @@ class Gr00tRequest:
         name = key if key in answer else f"action.{key}"
         if name not in answer:
             raise ShapeError(f"the answer has no action {key!r}; it has {join_names(map(str, answer))}")
-        given = answer[name]
-        if isinstance(given, Mapping):
+        part = answer[name]
+        if isinstance(part, Mapping):
             raise WrongProtocolError(
-                f"action {key!r} is a map of {join_names(map(str, given))}; expected an array in NPY or MNP: "
+                f"action {key!r} is a map of {join_names(map(str, part))}; expected an array in NPY or MNP: "
                 "the server writes arrays in another dialect"
             )
-        if isinstance(given, np.ndarray) and given.ndim == 1 and len(dims) == 1:
-            given = given[:, None]  # N1.5 omits the last axis of single values
-        return parse_action_rows(f"action {key!r}", given, len(dims))
+        if isinstance(part, np.ndarray) and part.ndim == 1 and len(dims) == 1:
+            part = part[:, None]  # N1.5 omits the last axis of single values
+        return parse_action_rows(f"action {key!r}", part, len(dims))
 
     def _remember(self, moment: ModelInput) -> None:
         while self._moments and self._moments[-1].step >= moment.step:
             self._moments.pop()  # a repeated request, or control restarted
         self._moments.append(moment)
-        wanted = self._wanted
-        assert wanted is not None
+        modalities = self._wanted
+        assert modalities is not None
         keeps = self._settings.history == "nearest"
         earliest = (
-            moment.step + self._pace * min(*wanted.video.steps, *wanted.state.steps, 0)
+            moment.step + self._pace * min(*modalities.video.steps, *modalities.state.steps, 0)
             if keeps
             else moment.step
         )
@@ -231,48 +241,50 @@ def _check_cover(parts: Mapping[str, Sequence[int]], width: int) -> None:
     places = sorted(dim for dims in parts.values() for dim in dims)
     if places == list(range(width)):
         return
-    twice = sorted({dim for dim in places if places.count(dim) > 1})
+    duplicates = sorted({dim for dim in places if places.count(dim) > 1})
     missing = [dim for dim in range(width) if dim not in places]
     beyond = [dim for dim in places if dim >= width]
-    said = [
-        f"{what} {dims}" for what, dims in (("not", missing), ("twice", twice), ("beyond", beyond)) if dims
+    problems = [
+        f"{label} {dims}"
+        for label, dims in (("not", missing), ("twice", duplicates), ("beyond", beyond))
+        if dims
     ]
     raise ConfigurationError(
-        f"policy.actions covers the {width} numbers of a row wrongly: {', '.join(said)}; "
+        f"policy.actions covers the {width} numbers of a row wrongly: {', '.join(problems)}; "
         f"allowed: each of 0 to {width - 1} once"
     )
 
 
-def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
+def _same_keys(name: str, modality: Modality, keys: Iterable[str]) -> None:
     """Check that the server's keys equal the deployment's.
 
     A server refuses a missing or surplus key without naming it.
     """
-    here = list(given)
-    if wanted.keys is not None and set(here) != set(wanted.keys):
+    own_keys = list(keys)
+    if modality.keys is not None and set(own_keys) != set(modality.keys):
         kind = ActionSpaceError if name == "actions" else ContradictionError
         raise kind(
-            f"the server's model has the {name} keys {join_names(wanted.keys)}; policy.{name} has {join_names(here)}; "
-            "correct policy." + name
+            f"the server's model has the {name} keys {join_names(modality.keys)}; policy.{name} has "
+            f"{join_names(own_keys)}; correct policy." + name
         )
 
 
-def _check_widths(name: str, wanted: Mapping[str, int], given: Parts) -> None:
-    for key, dims in given.items():
-        if wanted.get(key, len(dims)) != len(dims):
+def _check_widths(name: str, widths: Mapping[str, int], parts: Parts) -> None:
+    for key, dims in parts.items():
+        if widths.get(key, len(dims)) != len(dims):
             raise ContradictionError(
-                f"the server's model has {wanted[key]} numbers in {key!r}; policy.{name}.{key} has {len(dims)}"
+                f"the server's model has {widths[key]} numbers in {key!r}; policy.{name}.{key} has {len(dims)}"
             )
 
 
-def _language_key(wanted: Modality, given: str | None) -> str:
-    keys = (_LANGUAGE,) if wanted.keys is None and given is None else wanted.keys or ()
-    if given is not None and keys and given not in keys:
+def _language_key(modality: Modality, requested: str | None) -> str:
+    keys = (_LANGUAGE,) if modality.keys is None and requested is None else modality.keys or ()
+    if requested is not None and keys and requested not in keys:
         raise ContradictionError(
-            f"the server's model has the language keys {join_names(keys)}; policy.language_key = {given!r}"
+            f"the server's model has the language keys {join_names(keys)}; policy.language_key = {requested!r}"
         )
-    if given is not None:
-        return given
+    if requested is not None:
+        return requested
     if len(keys) != 1:
         raise ContradictionError(
             f"the server's model has the language keys {join_names(keys)}; set policy.language_key to one of them"
@@ -280,15 +292,15 @@ def _language_key(wanted: Modality, given: str | None) -> str:
     return keys[0]
 
 
-def _check_steps(name: str, wanted: Modality, history: str) -> None:
-    if len(wanted.steps) > _MOST_STEPS or max(wanted.steps) > 0:
+def _check_steps(name: str, modality: Modality, history: str) -> None:
+    if len(modality.steps) > _MOST_STEPS or max(modality.steps) > 0:
         raise PolicyError(
-            f"the server's model wants {name} at the steps {join_names(map(str, wanted.steps[:8]))}; "
+            f"the server's model wants {name} at the steps {join_names(map(str, modality.steps[:8]))}; "
             f"allowed: at most {_MOST_STEPS}, none of them in the future"
         )
-    if history == "none" and any(wanted.steps):
+    if history == "none" and any(modality.steps):
         raise ContradictionError(
-            f"the server's model sees {name} at the steps {join_names(map(str, wanted.steps))} before the newest, "
+            f"the server's model sees {name} at the steps {join_names(map(str, modality.steps))} before the newest, "
             'policy.history = "none"; allowed: "repeat" or "nearest"'
         )
 

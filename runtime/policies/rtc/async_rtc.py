@@ -36,23 +36,23 @@ class AsyncRtc(Dialect):
 
         Raises PolicyError if protocol, version or codec is wrong, or `rtc_supported` is not a bool.
         """
-        said = metadata.get("async_rtc")
-        if not isinstance(said, Mapping):
-            found = ", ".join(map(str, metadata)) or "nothing"
+        fields = metadata.get("async_rtc")
+        if not isinstance(fields, Mapping):
+            keys = ", ".join(map(str, metadata)) or "nothing"
             raise WrongProtocolError(
-                f"the server's metadata have no async_rtc map, only {found}: it is no {NAME} server; correct "
+                f"the server's metadata have no async_rtc map, only {keys}: it is no {NAME} server; correct "
                 "policy.rtc or policy.url"
             )
-        _check_version(said, "the server's async_rtc metadata")
-        codecs = said.get("image_transport_codecs", ["raw"])
+        _check_version(fields, "the server's async_rtc metadata")
+        codecs = fields.get("image_transport_codecs", ["raw"])
         if not isinstance(codecs, list) or "raw" not in codecs:
             raise WrongProtocolError(f"the server takes pictures as {codecs!r}; needed: raw")
-        supported = said.get("rtc_supported")
+        supported = fields.get("rtc_supported")
         if not isinstance(supported, bool):
             raise WrongProtocolError(
                 f"the server's async_rtc metadata have rtc_supported {supported!r}; needed: a bool"
             )
-        horizon = said.get("model_action_horizon")
+        horizon = fields.get("model_action_horizon")
         self._horizon = horizon if type(horizon) is int else None
         return supported
 
@@ -104,8 +104,8 @@ class AsyncRtc(Dialect):
 
 
 def _check_version(message: Mapping[str, Any], where: str) -> None:
-    found = (message.get("protocol"), message.get("protocol_version"))
-    if found != (NAME, VERSION):
+    version = (message.get("protocol"), message.get("protocol_version"))
+    if version != (NAME, VERSION):
         raise WrongProtocolError(
-            f"{where} has protocol {found[0]!r} version {found[1]!r}; needed: {NAME!r} version {VERSION}"
+            f"{where} has protocol {version[0]!r} version {version[1]!r}; needed: {NAME!r} version {VERSION}"
         )

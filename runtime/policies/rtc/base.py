@@ -68,12 +68,14 @@ def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any
     Raises PolicyError if the server accepts only versioned envelopes, or if the value is not such a map.
     """
     refuse_envelopes(metadata, name)
-    said = metadata.get("rtc")
-    if said is None:
+    declared = metadata.get("rtc")
+    if declared is None:
         return None
-    if not isinstance(said, Mapping) or not isinstance(said.get("dialect"), str):
-        raise WrongProtocolError(f"the server's metadata have rtc = {said!r}; expected a map with a dialect")
-    return said
+    if not isinstance(declared, Mapping) or not isinstance(declared.get("dialect"), str):
+        raise WrongProtocolError(
+            f"the server's metadata have rtc = {declared!r}; expected a map with a dialect"
+        )
+    return declared
 
 
 def refuse_envelopes(metadata: Mapping[str, Any], configured: str) -> None:

@@ -35,8 +35,8 @@ class Kai0(Dialect):
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """Return True if the metadata key `rtc` names this dialect, False if another, None without the key."""
-        said = declared_dialect(metadata, NAME)
-        return None if said is None else bool(said["dialect"] == NAME)
+        declared = declared_dialect(metadata, NAME)
+        return None if declared is None else bool(declared["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """Return the observation with the dialect's keys."""
@@ -70,7 +70,7 @@ class Kai0(Dialect):
 
 
 def _nested_lists(rows: Float32) -> np.ndarray[Any, np.dtype[np.float64]]:
-    made = np.zeros((len(rows), _COLUMNS))
-    kept = min(_COLUMNS, rows.shape[1])
-    made[:, :kept] = rows[:, :kept]
-    return made
+    padded = np.zeros((len(rows), _COLUMNS))
+    width = min(_COLUMNS, rows.shape[1])
+    padded[:, :width] = rows[:, :width]
+    return padded

@@ -57,16 +57,16 @@ class OpenpiRtc(Dialect):
 
         Raises ContradictionError if the server removes another number of rows than the deployment states.
         """
-        said = declared_dialect(metadata, NAME)
-        if said is None:
+        declared = declared_dialect(metadata, NAME)
+        if declared is None:
             return None
-        shift = said.get("shift")
+        shift = declared.get("shift")
         if shift is not None and self._keys.server_shift not in (None, shift):
             raise ContradictionError(
                 f"the server's metadata has rtc.shift = {shift!r}, policy.rtc_envelope.server_shift = "
                 f"{self._keys.server_shift}; correct the one that is wrong"
             )
-        return bool(said["dialect"] == NAME)
+        return bool(declared["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """Return the envelope with the observation and, if there is conditioning, the previous chunk."""

@@ -24,8 +24,8 @@ class PrevAction(Dialect):
         """Return True if the metadata key `rtc` (of our bundled server) names this dialect, False if another, None
         without it.
         """
-        said = declared_dialect(metadata, NAME)
-        return None if said is None else bool(said["dialect"] == NAME)
+        declared = declared_dialect(metadata, NAME)
+        return None if declared is None else bool(declared["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """Return the observation with both keys, or the observation itself without conditioning."""

@@ -58,42 +58,42 @@ def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[s
     ]
     if settings.known_hosts_file is not None:
         options.append(f'UserKnownHostsFile="{_at_home(settings.known_hosts_file)}"')
-    given = [ssh, "-T", "-a", "-x"]
+    arguments = [ssh, "-T", "-a", "-x"]
     if not settings.session:
-        given += ["-N", "-n"]
+        arguments += ["-N", "-n"]
     if settings.ssh_config is not None:
-        given += ["-F", _at_home(settings.ssh_config)]
+        arguments += ["-F", _at_home(settings.ssh_config)]
     for option in options:
-        given += ["-o", option]
+        arguments += ["-o", option]
     if settings.user is not None:
-        given += ["-l", settings.user]
+        arguments += ["-l", settings.user]
     if settings.port is not None:
-        given += ["-p", str(settings.port)]
+        arguments += ["-p", str(settings.port)]
     if settings.identity_file is not None:
-        given += ["-i", _at_home(settings.identity_file), "-o", "IdentitiesOnly=yes"]
+        arguments += ["-i", _at_home(settings.identity_file), "-o", "IdentitiesOnly=yes"]
     if settings.jump:
-        given += ["-J", ",".join(settings.jump)]
+        arguments += ["-J", ",".join(settings.jump)]
     host = f"[{far[0]}]" if ":" in far[0] else far[0]
-    given += ["-L", f"127.0.0.1:{port}:{host}:{far[1]}", "--", settings.host]
-    return [*given, _ECHO] if settings.session else given
+    arguments += ["-L", f"127.0.0.1:{port}:{host}:{far[1]}", "--", settings.host]
+    return [*arguments, _ECHO] if settings.session else arguments
 
 
 def require_files(settings: TunnelSettings) -> None:
     """Raise ConfigurationError if a file in the settings cannot be read: ssh would start without it and fail later."""
     files = ("identity_file", "known_hosts_file", "ssh_config")
     for name in files:
-        given = getattr(settings, name)
+        value = getattr(settings, name)
         # The file of known hosts may not exist yet.
-        if given in (None, "none") or (name == "known_hosts_file" and settings.host_keys == "accept-new"):
+        if value in (None, "none") or (name == "known_hosts_file" and settings.host_keys == "accept-new"):
             continue
-        path = _at_home(given)
+        path = _at_home(value)
         if not os.path.isfile(path):
             raise ConfigurationError(
-                f"policy.tunnel.{name} = {given!r}: there is no such file on this machine"
+                f"policy.tunnel.{name} = {value!r}: there is no such file on this machine"
             )
         if not os.access(path, os.R_OK):
             raise ConfigurationError(
-                f"policy.tunnel.{name} = {given!r} cannot be read by this station's account"
+                f"policy.tunnel.{name} = {value!r} cannot be read by this station's account"
             )
 
 

@@ -130,9 +130,9 @@ class TunnelKeeper:
 
     def _discard(self, ssh: Ssh, reason: str) -> None:
         """End this ssh and record the failure; if only its port was taken, a new start follows at once."""
-        taken = not self.status.up and port_was_taken(ssh.said)
+        port_taken = not self.status.up and port_was_taken(ssh.said)
         self.stop()
-        if taken and self._taken < _PORTS:
+        if port_taken and self._taken < _PORTS:
             self._taken += 1  # another port is certainly free
             return
         self._failed(reason)
@@ -145,8 +145,8 @@ class TunnelKeeper:
         self._taken = 0
         since = now if before.up else before.since
         self._set_status(up=False, since=since, port=0, why=reason, failures=before.failures + 1)
-        again = self._back_off.remaining_delay(now)
-        log.warning("the tunnel to %s is down: %s; trying again in %.1f s", self._name, reason, again)
+        delay_s = self._back_off.remaining_delay(now)
+        log.warning("the tunnel to %s is down: %s; trying again in %.1f s", self._name, reason, delay_s)
 
     def _set_status(self, **changes: Any) -> None:
         with self._changed:

@@ -45,9 +45,9 @@ def _user(name: str) -> str:
 
 
 def _jump(hop: str) -> str:
-    found = _JUMP.fullmatch(hop)
-    host = found["host"].strip("[]") if found else ""
-    if not found or not is_host(host) or not 1 <= int(found["port"] or 22) <= 65535:
+    match = _JUMP.fullmatch(hop)
+    host = match["host"].strip("[]") if match else ""
+    if not match or not is_host(host) or not 1 <= int(match["port"] or 22) <= 65535:
         raise ValueError("must be a host as in gateway.lab, user@gateway.lab or user@gateway.lab:2222")
     return hop
 

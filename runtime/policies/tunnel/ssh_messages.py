@@ -38,10 +38,10 @@ def port_was_taken(said: Sequence[str]) -> bool:
 
 def explain_exit(said: Sequence[str], code: int) -> str:
     """Return the last two lines of ssh's output, with advice if a known cause matches them."""
-    told = "; ".join(list(said)[-2:]) or f"ssh exited with {code} and no output"
+    text = "; ".join(list(said)[-2:]) or f"ssh exited with {code} and no output"
     if code not in (_OWN_FAULT, *_SIGNALS):
-        return f"{told}: {_OVER}"
-    return next((f"{told}: {advice}" for pattern, advice in _ADVICE if re.search(pattern, told)), told)
+        return f"{text}: {_OVER}"
+    return next((f"{text}: {advice}" for pattern, advice in _ADVICE if re.search(pattern, text)), text)
 
 
 def explain_session_refused(refusal: str) -> str:

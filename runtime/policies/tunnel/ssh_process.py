@@ -31,25 +31,25 @@ def is_listening(pid: int, port: int) -> bool:
 
 def _listeners(pid: int, port: int) -> list[str]:
     """Return the inodes of the sockets that listen at `port` in the network namespace of the process `pid`."""
-    here = f"{_LOOPBACK:08X}:{port:04X}"
+    local_address = f"{_LOOPBACK:08X}:{port:04X}"
     try:
         rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text("ascii").splitlines()[1:]]
     except OSError:  # it has ended
         return []
-    return [row[9] for row in rows if row[1] == here and row[3] == _LISTEN]
+    return [row[9] for row in rows if row[1] == local_address and row[3] == _LISTEN]
 
 
 def _sockets(pid: int) -> set[str]:
-    found = set()
+    targets = set()
     try:
         for entry in os.scandir(f"/proc/{pid}/fd"):
             try:
-                found.add(os.readlink(entry.path))
+                targets.add(os.readlink(entry.path))
             except OSError:  # closed meanwhile
                 continue
     except OSError:  # it has ended
         return set()
-    return found
+    return targets
 
 
 _BOUND = Path(__file__).with_name("die_with_parent.py")
@@ -61,9 +61,9 @@ _REFUSED = re.compile(r"channel \d+: open failed: (.+)")
 
 def free_port() -> int:
     """Return a loopback port on which nothing listens; another process may take it before it is used."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 class Ssh:
@@ -138,8 +138,8 @@ class Ssh:
             self._handle_line(pipe, piece)
 
     def _handle_line(self, pipe: int, piece: bytes) -> None:
-        *lines, rest = (self._rests[pipe] + piece).split(b"\n")
-        self._rests[pipe] = rest[-_WIDTH:]
+        *lines, remainder = (self._rests[pipe] + piece).split(b"\n")
+        self._rests[pipe] = remainder[-_WIDTH:]
         for line in lines:
             if line == _WORD:
                 self._echoed = True
