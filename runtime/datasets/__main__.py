@@ -129,19 +129,19 @@ def _add_target(parser: argparse.ArgumentParser, dataset: Folder, required: bool
 
 
 def _publish(options: argparse.Namespace) -> int:
-    done = publish(
+    result = publish(
         options.episode,
         options.to,
         success=options.success,
         include_interrupted=options.include_interrupted,
         version=options.version,
     )
-    verb = "published" if done.created else "published anew"
+    verb = "published" if result.created else "published anew"
     print(
-        f"{verb}: {options.episode} as episode {done.episode_index} of {done.dataset}, {done.frames} frames"
+        f"{verb}: {options.episode} as episode {result.episode_index} of {result.dataset}, {result.frames} frames"
     )
-    if done.remark:
-        print(f"remark: {done.remark}")
+    if result.remark:
+        print(f"remark: {result.remark}")
     return 0
 
 
@@ -159,11 +159,11 @@ def _convert(options: argparse.Namespace) -> int:
 
 def renamed(pairs: Sequence[str]) -> dict[str, str]:
     """Parse pairs OLD=NEW; return the new name by old name. Raises: RecordingError."""
-    found = [pair.partition("=") for pair in pairs]
-    for old, sign, new in found:
+    parsed = [pair.partition("=") for pair in pairs]
+    for old, sign, new in parsed:
         if not (old and sign and new):
             raise RecordingError(f"--rename {old}{sign}{new}: expected OLD=NEW")
-    return {old: new for old, _, new in found}
+    return {old: new for old, _, new in parsed}
 
 
 def _merge(options: argparse.Namespace) -> int:
@@ -179,8 +179,8 @@ def _split(options: argparse.Namespace) -> int:
         if Path(name).name != name or name in ("", ".", "..") or options.to / name in targets:
             raise RecordingError(f"{part!r}: expected NAME=EPISODES, with a name of its own for a folder")
         targets[options.to / name] = episodes(which)
-    done = operations.split(options.dataset, targets, options.version, reencode=options.reencode)
-    return max(_print_result(one) for one in done)
+    results = operations.split(options.dataset, targets, options.version, reencode=options.reencode)
+    return max(_print_result(result) for result in results)
 
 
 def _delete(options: argparse.Namespace) -> int:
@@ -194,10 +194,10 @@ def _repair(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    found = check_with_remarks(options.dataset)
-    for remark in found.remarks:
+    report = check_with_remarks(options.dataset)
+    for remark in report.remarks:
         print(f"remark: {remark}")
-    return _report(options.dataset, found.problems)
+    return _report(options.dataset, report.problems)
 
 
 def _push(options: argparse.Namespace) -> int:
@@ -212,16 +212,16 @@ def episodes(text: str, most: int = MOST) -> list[int]:
     Raises:
         RecordingError: The text is invalid or names more than `most` episodes.
     """
-    found: list[int] = []
+    indices: list[int] = []
     for part in text.split(","):
         first, colon, end = part.partition(":")
         if not is_index(first) or (colon and not (is_index(end) and int(first) < int(end))):
             raise RecordingError(f"{text!r:.80} names no episodes: expected 3, or 0:4 (without 4), or 0:4,7")
         some = range(int(first), int(end)) if colon else [int(first)]
-        if len(found) + len(some) > most:  # probably a typing error, which would exhaust the memory
+        if len(indices) + len(some) > most:  # probably a typing error, which would exhaust the memory
             raise RecordingError(f"{text!r:.80} names too many episodes: at most {most:,} in one order")
-        found += some
-    return found
+        indices += some
+    return indices
 
 
 def is_index(text: str) -> bool:
@@ -229,11 +229,11 @@ def is_index(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
-def _print_result(done: AssemblyResult) -> int:
-    print(f"written: {done.dataset}, {done.version}, {done.episodes} episodes, {done.frames} frames")
-    for video in done.encoded:
+def _print_result(result: AssemblyResult) -> int:
+    print(f"written: {result.dataset}, {result.version}, {result.episodes} episodes, {result.frames} frames")
+    for video in result.encoded:
         print(f"coded again: {video}")
-    for thing in done.left_out:
+    for thing in result.left_out:
         print(f"left out: {thing}")
     return 0
 

@@ -166,39 +166,41 @@ def assemble(
     _require_same(parts)
     with Draft(Path(target), replacing) as draft:
         try:
-            made = _Assembly(draft.folder, version, parts, reencode, not replacing).write(tell)
+            result = _Assembly(draft.folder, version, parts, reencode, not replacing).write(tell)
         except OSError as error:
             raise disk_error("assembling", draft.folder, error) from error
         draft.commit()
-    return replace(made, dataset=Path(target))
+    return replace(result, dataset=Path(target))
 
 
 def _require_same(parts: Sequence[EpisodeRef]) -> None:
     first = parts[0].source
     for source in _sources(parts)[1:]:
-        one, other = first.dataset, source.dataset
-        found = [
-            f"{name} is {stated!r}, there {given!r}"
-            for name, stated, given in (
-                ("robot_type", one.info.get("robot_type"), other.info.get("robot_type")),
-                ("fps", one.fps, other.fps),
+        left, right = first.dataset, source.dataset
+        problems = [
+            f"{name} is {stated!r}, there {right_value!r}"
+            for name, stated, right_value in (
+                ("robot_type", left.info.get("robot_type"), right.info.get("robot_type")),
+                ("fps", left.fps, right.fps),
             )
-            if stated != given
+            if stated != right_value
         ]
-        found += feature_differences(first.features, source.features)
-        found += [
-            f"video {key!r} is {mine}, there {theirs}"
+        problems += feature_differences(first.features, source.features)
+        problems += [
+            f"video {key!r} is {mine}, there {right_codec}"
             for key in layout.video_keys(first.features)
-            if (mine := _codec(first, key)) != (theirs := _codec(source, key))
+            if (mine := _codec(first, key)) != (right_codec := _codec(source, key))
         ]
-        if "subtask_index" in first.features and _bytes(one, SUBTASKS) != _bytes(other, SUBTASKS):
-            found.append(f"{SUBTASKS} differ, so that a subtask_index would mean another subtask")
-        if found:
-            raise RecordingError(f"{one.root} and {other.root} do not belong together: {'; '.join(found)}")
+        if "subtask_index" in first.features and _bytes(left, SUBTASKS) != _bytes(right, SUBTASKS):
+            problems.append(f"{SUBTASKS} differ, so that a subtask_index would mean another subtask")
+        if problems:
+            raise RecordingError(
+                f"{left.root} and {right.root} do not belong together: {'; '.join(problems)}"
+            )
     uuids = Counter(part.source.eva[part.index]["uuid"] for part in parts if part.index in part.source.eva)
-    twice = [uuid for uuid, count in uuids.items() if count > 1]
-    if twice:
-        raise RecordingError(f"the same episode would be there twice: {twice}")
+    duplicates = [uuid for uuid, count in uuids.items() if count > 1]
+    if duplicates:
+        raise RecordingError(f"the same episode would be there twice: {duplicates}")
 
 
 def _bytes(dataset: Dataset, name: str) -> bytes | None:
@@ -250,37 +252,41 @@ class _Assembly:
 
         Other entries, unless they belong to the format, are reported as left out.
         """
-        said = [source.dataset.info for source in self._sources]
-        for info, source in zip(said, self._sources, strict=True):
+        infos = [source.dataset.info for source in self._sources]
+        for info, source in zip(infos, self._sources, strict=True):
             for key in sorted(set(info) - layout.INFO_KEYS):
-                if any(other.get(key) != info[key] for other in said):
+                if any(compared.get(key) != info[key] for compared in infos):
                     self._left_out[f"{key!r} in info.json of {source.dataset.root}: others say another"] = (
                         None
                     )
-        return {key: value for key, value in said[0].items() if all(one.get(key) == value for one in said)}
+        return {
+            key: value
+            for key, value in infos[0].items()
+            if all(source_info.get(key) == value for source_info in infos)
+        }
 
     def _splits(self) -> dict[str, str]:
         """Return the sources' splits with the episodes' new indices; episodes of a source without splits are for
         training.
         """
-        found: dict[str, list[int]] = {}
+        splits: dict[str, list[int]] = {}
         for source in self._sources:
-            named, given = {}, source.dataset.info.get("splits") or {}
-            for name, value in given.items():
+            named, stated = {}, source.dataset.info.get("splits") or {}
+            for name, value in stated.items():
                 try:
                     named[name] = set(episodes_of(name, value))
                 except RecordingError as error:
                     self._left_out[f"{source.dataset.root}: {error}"] = None
-            there = [listed.index for listed in source.dataset.episodes]
+            indices = [listed.index for listed in source.dataset.episodes]
             # If indices have gaps, splits that cover 0 to count - 1 refer to positions, as in LeRobot.
-            counted = set().union(*named.values()) == set(range(len(there)))
+            counted = set().union(*named.values()) == set(range(len(indices)))
             for place, part in enumerate(self._parts):
                 if part.source is source:
-                    number = there.index(part.index) if counted else part.index
+                    number = indices.index(part.index) if counted else part.index
                     for name in named or (TRAIN,):
                         if not named or number in named[name]:
-                            found.setdefault(name, []).append(place)
-        return written(found)
+                            splits.setdefault(name, []).append(place)
+        return written(splits)
 
     def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
         """Return the lines of the list of episodes, with the keys that only the sources' writers know, if they can be
@@ -288,16 +294,16 @@ class _Assembly:
         """
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]
-        kept: list[Line] = [{} for _ in owns]
+        stored: list[Line] = [{} for _ in owns]
         for key in dict.fromkeys(key for own in owns for key in own):
             values = [_without_nan(own.get(key)) for own in owns]
             if is_storable(values) if v30 else _is_json(values):
-                for line, own, value in zip(kept, owns, values, strict=True):
+                for line, own, value in zip(stored, owns, values, strict=True):
                     line |= {key: value} if key in own else {}
             else:
                 kind = "parquet" if v30 else "JSON"
                 self._left_out[f"{key!r} of the episodes: it cannot be written as {kind}"] = None
-        return [own | line for own, line in zip(kept, lines, strict=True)]
+        return [own | line for own, line in zip(stored, lines, strict=True)]
 
     def _empty(self, key: str, feature: Mapping[str, Any]) -> bool:
         if holds_nothing(feature):
@@ -312,11 +318,11 @@ class _Assembly:
             line = self._line(part, index, first)
             lines.append(line)
             statistics.append({"episode_index": index, "stats": self._episode(part, line, first)})
-            told = part.source.eva.get(part.index)
-            if told is not None:
+            fields = part.source.eva.get(part.index)
+            if fields is not None:
                 origin = {COPIED_FROM: part.source.dataset.root.absolute().name} if self._copying else {}
-                eva.append(told | {"episode_index": index} | origin)
-                self._sides(part, str(told["uuid"]))
+                eva.append(fields | {"episode_index": index} | origin)
+                self._sides(part, str(fields["uuid"]))
             first += line["length"]
         tasks = tuple({"task_index": number, "task": task} for number, task in enumerate(self._tasks))
         listed = tuple(self._episode_lines(lines))
@@ -361,9 +367,9 @@ class _Assembly:
         for key in layout.image_keys(self._features):
             if key not in statistics:
                 name = f"{part.source.dataset.root}, episode {part.index}, column {key!r}"
-                made = picture_statistic(StoredImages(name, table.column(key).to_pylist(), self._root))
-                if made is not None:
-                    statistics[key] = made
+                statistic = picture_statistic(StoredImages(name, table.column(key).to_pylist(), self._root))
+                if statistic is not None:
+                    statistics[key] = statistic
         if self._info["codebase_version"] == layout.V21:
             statistics |= {key: _of_three(statistics[key]) for key in self._video_keys if key in statistics}
         return statistics | _fill_statistics(statistics, self._computed(part, table))
@@ -374,16 +380,16 @@ class _Assembly:
 
     def _source_statistics(self, part: EpisodeRef) -> dict[str, Statistic]:
         """Return the statistics that the source has for an episode, without those that are computed anew."""
-        found = {}
+        statistics = {}
         for key, statistic in part.source.statistics.get(part.index, {}).items():
             if key not in self._features or key in _PLACED:
                 continue
-            if why := fault(statistic, figure_shapes(self._features[key])):
+            if reason := fault(statistic, figure_shapes(self._features[key])):
                 where = f"{part.source.dataset.root}, episode {part.index}"
-                self._left_out[f"statistics of {where}, {key!r}: {why}; they are made anew"] = None
+                self._left_out[f"statistics of {where}, {key!r}: {reason}; they are made anew"] = None
             else:
-                found[key] = statistic
-        return found
+                statistics[key] = statistic
+        return statistics
 
     def _computed(self, part: EpisodeRef, table: pa.Table) -> dict[str, Statistic]:
         columns = {}
@@ -413,8 +419,8 @@ class _Assembly:
             if name not in columns and name not in source.features:
                 self._left_out[f"column {name!r}: it is declared nowhere"] = None
         worded = [key for key, feature in columns.items() if feature["dtype"] == LANGUAGE]
-        given = {key: table.schema.field(key).type for key in worded}
-        rows, schema = table.num_rows, arrow_schema(self._features, given)
+        types = {key: table.schema.field(key).type for key in worded}
+        rows, schema = table.num_rows, arrow_schema(self._features, types)
         fresh = {
             "episode_index": np.full(rows, line["episode_index"], np.int64),
             "index": np.arange(first, first + rows, dtype=np.int64),
@@ -428,16 +434,16 @@ class _Assembly:
                 arrays.append(self._cast(part, table.column(field.name), field))
         return pa.Table.from_arrays(arrays, schema=schema)
 
-    def _task_numbers(self, part: EpisodeRef, given: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        known = part.source.dataset.tasks
-        unknown = sorted(set(given.tolist()) - set(known))
+    def _task_numbers(self, part: EpisodeRef, numbers: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        tasks = part.source.dataset.tasks
+        unknown = sorted(set(numbers.tolist()) - set(tasks))
         if unknown:
             raise RecordingError(
                 f"{part.source.dataset.root}, episode {part.index}: task_index {unknown} is no task, "
-                f"there are {sorted(known)}"
+                f"there are {sorted(tasks)}"
             )
-        numbered = {number: self._tasks.index(task) for number, task in known.items()}
-        return np.array([numbered[number] for number in given.tolist()], np.int64)
+        numbered = {number: self._tasks.index(task) for number, task in tasks.items()}
+        return np.array([numbered[number] for number in numbers.tolist()], np.int64)
 
     def _cast(self, part: EpisodeRef, column: pa.ChunkedArray, field: pa.Field) -> pa.Array:
         import pyarrow as pa
@@ -454,17 +460,17 @@ class _Assembly:
                 raise RecordingError(f"{root}, {where} has other than one value per row, declared is one")
             array = array.flatten()
         try:
-            found = array.cast(field.type)
+            converted = array.cast(field.type)
         except pa.ArrowException as error:
             raise RecordingError(
                 f"{root}, {where} is {array.type}, declared {field.type}: {error}"
             ) from error
-        if changed := _changed(array, found):
+        if changed := _changed(array, converted):
             raise RecordingError(
                 f"{root}, {where} is {array.type}, declared {field.type}, which cannot hold {changed}: "
                 "declare it as it is stored"
             )
-        return found
+        return converted
 
     def _video(self, part: EpisodeRef, key: str, target: Path, frames: int) -> None:
         span = part.source.dataset.entry(part.index).videos[part.source.names.old_name(key)]
@@ -515,16 +521,22 @@ class _Assembly:
         """Copy all files of the replaced folder except those of the format itself and those of its episodes."""
         root = source.dataset.root
         listed = source.dataset.episodes
-        known = {root / name for name in _OURS} | {root / LOCK}
-        known |= {path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))}
-        known |= {
-            path for told in source.eva.values() for path in sidecar_paths(root, str(told["uuid"])).values()
+        carried = {root / name for name in _OURS} | {root / LOCK}
+        carried |= {
+            path
+            for episode in listed
+            for path in (episode.data, *(span.path for span in episode.videos.values()))
         }
-        known |= set((root / EPISODES_FOLDER).rglob("*.parquet"))
+        carried |= {
+            path
+            for fields in source.eva.values()
+            for path in sidecar_paths(root, str(fields["uuid"])).values()
+        }
+        carried |= set((root / EPISODES_FOLDER).rglob("*.parquet"))
         for path in sorted(root.rglob("*")):
             name = path.relative_to(root)
             if (
-                path in known
+                path in carried
                 or name.parts[0] == layout.PUBLISHING
                 or (path.is_dir() and not path.is_symlink())
             ):
@@ -539,39 +551,41 @@ def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
     """Return the lines by the index of their episode. Raises: RecordingError if two lines are about the same
     episode.
     """
-    found = {line["episode_index"]: line for line in lines}
-    if len(found) < len(lines):
+    by_index = {line["episode_index"]: line for line in lines}
+    if len(by_index) < len(lines):
         counts = Counter(line["episode_index"] for line in lines)
-        twice = sorted(index for index, count in counts.items() if count > 1)
+        duplicates = sorted(index for index, count in counts.items() if count > 1)
         raise RecordingError(
-            f"{root / layout.EVA_EPISODES} has more than one line about the episodes {twice}"
+            f"{root / layout.EVA_EPISODES} has more than one line about the episodes {duplicates}"
         )
-    return found
+    return by_index
 
 
 def _is_its_own(path: Path, root: Path) -> bool:
     """Return True if `path` leads into the dataset, or into the cache in which a hub keeps a snapshot's files."""
-    here = root.resolve()
-    places = (here, here.parent.parent / "blobs")
+    resolved = root.resolve()
+    places = (resolved, resolved.parent.parent / "blobs")
     return any(path.resolve().is_relative_to(place) for place in places)
 
 
-def _changed(given: pa.Array, made: pa.Array) -> str:
+def _changed(original: pa.Array, converted: pa.Array) -> str:
     """Return a sentence on the first value that a cast to another type changed by more than float32 rounds; "" if
     none.
     """
-    before, after = (np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (given, made))
+    before, after = (
+        np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (original, converted)
+    )
     if before.dtype == after.dtype or not all(
-        np.issubdtype(one.dtype, np.number) or one.dtype == bool for one in (before, after)
+        np.issubdtype(values.dtype, np.number) or values.dtype == bool for values in (before, after)
     ):
         return ""
-    exact, kept = before.astype(np.float64), after.astype(np.float64)
+    exact, stored = before.astype(np.float64), after.astype(np.float64)
     finite = np.isfinite(exact)
     spread = float(np.ptp(exact[finite])) if finite.any() else 0.0
     with np.errstate(invalid="ignore", over="ignore"):
         allowed = _LOST * spread if spread else _ROUNDED * np.maximum(np.abs(exact), 1.0)
-        off = finite & ~(np.abs(kept - exact) <= allowed)
-    return f"{exact[off][0]:.17g} ({kept[off][0]:.9g} would be left)" if off.any() else ""
+        off = finite & ~(np.abs(stored - exact) <= allowed)
+    return f"{exact[off][0]:.17g} ({stored[off][0]:.9g} would be left)" if off.any() else ""
 
 
 def _leaves(array: pa.Array) -> pa.Array:
@@ -602,7 +616,11 @@ def _folders(source: SourceDataset) -> set[str]:
     """Return the names of a dataset's folders that contain only files of the format and of episodes."""
     root = source.dataset.root
     listed = source.dataset.episodes
-    files = [path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))]
+    files = [
+        path
+        for episode in listed
+        for path in (episode.data, *(span.path for span in episode.videos.values()))
+    ]
     return {"meta", FOLDER, EPISODES_FOLDER, *(path.relative_to(root).parts[0] for path in files)}
 
 
@@ -615,7 +633,7 @@ def _of_three(statistic: Statistic) -> Statistic:
 
 
 def _fill_statistics(
-    given: Mapping[str, Statistic], computed: Mapping[str, Statistic]
+    stored: Mapping[str, Statistic], computed: Mapping[str, Statistic]
 ) -> dict[str, Statistic]:
-    """Return the statistic of each column: figures of `given`, and the computed ones for those that are missing."""
-    return {key: {**statistic, **given.get(key, {})} for key, statistic in computed.items()}
+    """Return the statistic of each column: figures of `stored`, and the computed ones for those that are missing."""
+    return {key: {**statistic, **stored.get(key, {})} for key, statistic in computed.items()}

@@ -120,7 +120,7 @@ class Catalog:
         """
         if not self.info:
             return
-        found = [
+        problems = [
             f"{name} is {stated!r} in the dataset, {new!r} here"
             for name, stated, new in (
                 ("robot_type", self.info.get("robot_type"), robot),
@@ -128,9 +128,9 @@ class Catalog:
             )
             if stated != new
         ]
-        found += feature_differences(self.features, features)
-        if found:
-            raise RecordingError(f"{self.root} holds other data: {'; '.join(found)}. Publish elsewhere")
+        problems += feature_differences(self.features, features)
+        if problems:
+            raise RecordingError(f"{self.root} holds other data: {'; '.join(problems)}. Publish elsewhere")
 
     def with_info(self, robot: str, fps: float, features: Features, version: str) -> Catalog:
         """Return the catalog with its info.json; if there is none yet, with a new one that has these properties."""
@@ -144,50 +144,50 @@ class Catalog:
             return self.episodes[index] | {"tasks": list(tasks), "length": length}
         last = self.episodes[-1] if self.episodes else {}
         lists = {name: last.get(name, 0) for name in (parquet_lists.CHUNK, parquet_lists.FILE)}
-        made = single_file_line(self.info, self._next_file(), tasks, length, self.first_index(index))
-        return made | {"episode_index": index} | (lists if self.version == layout.V30 else {})
+        fields = single_file_line(self.info, self._next_file(), tasks, length, self.first_index(index))
+        return fields | {"episode_index": index} | (lists if self.version == layout.V30 else {})
 
     def _next_file(self) -> int:
         """Return the number of the new episode's file: in v3.0 the next after all files, in v2.1 the episode's
         index.
         """
         size = int(self.info.get("chunks_size") or layout.CHUNKS_SIZE)
-        taken = [
+        numbers = [
             int(line[name]) * size + int(line[name.replace("chunk_index", "file_index")])
             for line in self.episodes
             for name in line
             if name.endswith("/chunk_index") and name != parquet_lists.CHUNK
         ]
-        return max(taken, default=len(self.episodes) - 1) + 1
+        return max(numbers, default=len(self.episodes) - 1) + 1
 
     def entry(self, line: Line) -> EpisodeEntry:
         """Return the files of the episode of `line`.
 
         Raises: RecordingError if they also contain other episodes, because such files must not change.
         """
-        made = entry(self.root, self.info, line)
-        if not made.shared or made.index == len(self.episodes):
-            return made
-        files = {made.data, *(span.path for span in made.videos.values())}
-        for other in self.episodes:
-            theirs = entry(self.root, self.info, other)
-            if theirs.index != made.index and files & {
-                theirs.data,
-                *(span.path for span in theirs.videos.values()),
+        result = entry(self.root, self.info, line)
+        if not result.shared or result.index == len(self.episodes):
+            return result
+        files = {result.data, *(span.path for span in result.videos.values())}
+        for other_line in self.episodes:
+            other_entry = entry(self.root, self.info, other_line)
+            if other_entry.index != result.index and files & {
+                other_entry.data,
+                *(span.path for span in other_entry.videos.values()),
             }:
                 raise RecordingError(
-                    f"{self.root}: episode {made.index} shares its files with episode {theirs.index}: "
+                    f"{self.root}: episode {result.index} shares its files with episode {other_entry.index}: "
                     "it cannot be written anew in its place"
                 )
-        return made
+        return result
 
     def with_episode(self, line: Line, statistics: Mapping[str, Statistic], eva: Line | None) -> Catalog:
         """Return the catalog with the episode of `line` added or replaced, and updated totals."""
         index = int(line["episode_index"])
         tasks = self.tasks
         for task in line["tasks"]:
-            if task not in {known["task"] for known in tasks}:
-                number = max((int(known["task_index"]) for known in tasks), default=-1) + 1
+            if task not in {row["task"] for row in tasks}:
+                number = max((int(row["task_index"]) for row in tasks), default=-1) + 1
                 tasks = (*tasks, {"task_index": number, "task": task})
         changed = replace(
             self,
@@ -243,9 +243,11 @@ class Catalog:
         except (KeyError, TypeError, ValueError) as error:
             for line in self.statistics:
                 for key, statistic in line["stats"].items():
-                    if key in self.features and (why := fault(statistic, figure_shapes(self.features[key]))):
+                    if key in self.features and (
+                        reason := fault(statistic, figure_shapes(self.features[key]))
+                    ):
                         raise RecordingError(
-                            f"{self.root / 'meta'}: statistics of episode {line['episode_index']}, {key!r}: {why}. "
+                            f"{self.root / 'meta'}: statistics of episode {line['episode_index']}, {key!r}: {reason}. "
                             "`convert` makes them anew in a copy"
                         ) from error
             raise

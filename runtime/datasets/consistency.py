@@ -67,10 +67,10 @@ def check(dataset: Path) -> list[str]:
 
 def check_with_remarks(dataset: Path) -> CheckResult:
     """Return the contradictions that `check` finds, and also remarks."""
-    said = _problems(Path(dataset))
+    findings = _problems(Path(dataset))
     return CheckResult(
-        [one for one in said if not isinstance(one, _Remark)],
-        [str(one) for one in said if isinstance(one, _Remark)],
+        [finding for finding in findings if not isinstance(finding, _Remark)],
+        [str(finding) for finding in findings if isinstance(finding, _Remark)],
     )
 
 
@@ -137,9 +137,9 @@ def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
     """
     first = 0
     for line in episodes:
-        given = line["dataset_from_index"], line["dataset_to_index"]
-        if given != (first, first + line["length"]):
-            yield f"episode {line['episode_index']} is rows {given}, expected {(first, first + line['length'])}"
+        stated = line["dataset_from_index"], line["dataset_to_index"]
+        if stated != (first, first + line["length"]):
+            yield f"episode {line['episode_index']} is rows {stated}, expected {(first, first + line['length'])}"
         first += line["length"]
         for key in layout.video_keys(info["features"]):
             start, end = (float(line[f"videos/{key}/{edge}_timestamp"]) for edge in ("from", "to"))
@@ -196,14 +196,14 @@ def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: i
     for key, feature in columns.items():
         if key not in table.column_names or holds_nothing(feature):
             continue
-        given = table.schema.field(key).type
+        stored = table.schema.field(key).type
         if feature["dtype"] == LANGUAGE:
-            if not is_language(given):
-                yield f"{key!r} is stored as {given}, expected a list of structs with role and content"
+            if not is_language(stored):
+                yield f"{key!r} is stored as {stored}, expected a list of structs with role and content"
             continue
         declared = arrow_type(key, feature)
-        if not _same_type(given, declared):
-            yield f"{key!r} is stored as {given}, declared {declared}"
+        if not _same_type(stored, declared):
+            yield f"{key!r} is stored as {stored}, declared {declared}"
     if table.num_rows != length:
         yield f"{table.num_rows} rows, listed are {length}"
     frames = np.arange(table.num_rows)
@@ -229,13 +229,13 @@ def _until_unreadable(problems: Iterator[str]) -> Iterator[str]:
 def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
     if "timestamp" not in table.column_names or not table.num_rows:
         return
-    given = column_array(table, "timestamp").astype(np.float64)[:, :1].reshape(-1)
+    stored = column_array(table, "timestamp").astype(np.float64)[:, :1].reshape(-1)
     expected = np.arange(table.num_rows) / float(info["fps"])
     allowed = TOLERANCE + np.spacing(np.float32(expected[-1]))  # plus float32's resolution
-    near = np.abs(given - expected) <= allowed
+    near = np.abs(stored - expected) <= allowed
     if not near.all():
         row = int(near.argmin())
-        yield f"'timestamp' is not k / fps: row {row} has {given[row]:g}, expected {expected[row]:g} s"
+        yield f"'timestamp' is not k / fps: row {row} has {stored[row]:g}, expected {expected[row]:g} s"
 
 
 def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
@@ -284,21 +284,21 @@ def _rows(marked: np.ndarray[Any, Any]) -> str:
     return f"{int(marked.sum())} rows, the first is {int(marked.argmax())}"
 
 
-def _size_problem(what: str, size: tuple[int, int], feature: Mapping[str, Any]) -> str:
+def _size_problem(label: str, size: tuple[int, int], feature: Mapping[str, Any]) -> str:
     """Return a sentence if an image's height or width differs from the declaration, else ""."""
     declared = picture_size(feature)[:2]
     if size == declared:
         return ""
     turned = ": rows and columns are exchanged" if size == declared[::-1] else ""
-    return f"{what} is {size[0]} rows by {size[1]} columns, declared {declared[0]} by {declared[1]}{turned}"
+    return f"{label} is {size[0]} rows by {size[1]} columns, declared {declared[0]} by {declared[1]}{turned}"
 
 
-def _same_type(given: pa.DataType, expected: pa.DataType) -> bool:
+def _same_type(stored: pa.DataType, expected: pa.DataType) -> bool:
     import pyarrow as pa
 
-    if pa.types.is_fixed_size_list(given) and pa.types.is_fixed_size_list(expected):
-        return bool(given.value_type == expected.value_type and given.list_size == expected.list_size)
-    return bool(given == expected)
+    if pa.types.is_fixed_size_list(stored) and pa.types.is_fixed_size_list(expected):
+        return bool(stored.value_type == expected.value_type and stored.list_size == expected.list_size)
+    return bool(stored == expected)
 
 
 def _task_indices(table: pa.Table, tasks: set[int]) -> Iterator[str]:
@@ -326,18 +326,18 @@ def _statistics(
             values = column_array(table, key).astype(np.float64)
         except RecordingError:
             continue  # reported by `_values`
-        known = values[finite(values)]
+        finite_rows = values[finite(values)]
         if key in statistics:
-            yield from _column_statistic(key, feature, known, statistics[key])
-        elif len(known) and "image" not in key and key not in INDEX_COLUMNS:
+            yield from _column_statistic(key, feature, finite_rows, statistics[key])
+        elif len(finite_rows) and "image" not in key and key not in INDEX_COLUMNS:
             yield f"{key!r} has no statistics"
 
 
 def _picture_statistic(key: str, feature: Mapping[str, Any], statistic: Any) -> Iterator[str]:
     if statistic is None:
         yield f"{key!r} has no statistics"
-    elif why := fault(statistic, figure_shapes(feature)):
-        yield f"statistics of {key!r}: {why}"
+    elif reason := fault(statistic, figure_shapes(feature)):
+        yield f"statistics of {key!r}: {reason}"
     elif not is_depth(feature):  # the unit of depth is chosen by its writer
         for name in FIGURES:
             value = np.asarray(statistic[name], dtype=np.float64)
@@ -346,26 +346,26 @@ def _picture_statistic(key: str, feature: Mapping[str, Any], statistic: Any) -> 
 
 
 def _column_statistic(
-    key: str, feature: Mapping[str, Any], known: np.ndarray[Any, Any], statistic: Any
+    key: str, feature: Mapping[str, Any], finite_rows: np.ndarray[Any, Any], statistic: Any
 ) -> Iterator[str]:
-    if why := fault(statistic, figure_shapes(feature)):
-        yield f"statistics of {key!r}: {why}"
+    if reason := fault(statistic, figure_shapes(feature)):
+        yield f"statistics of {key!r}: {reason}"
         return
-    if list(statistic["count"]) != [len(known)]:
-        yield f"count of {key!r} is {statistic['count']}, known are {len(known)} rows"
+    if list(statistic["count"]) != [len(finite_rows)]:
+        yield f"count of {key!r} is {statistic['count']}, known are {len(finite_rows)} rows"
         return
     figures = {
-        "min": known.min(axis=0),
-        "max": known.max(axis=0),
-        "mean": known.mean(axis=0),
-        "std": known.std(axis=0),
+        "min": finite_rows.min(axis=0),
+        "max": finite_rows.max(axis=0),
+        "mean": finite_rows.mean(axis=0),
+        "std": finite_rows.std(axis=0),
     }
     for name, value in figures.items():
-        given = np.asarray(statistic[name], dtype=np.float64).reshape(-1)
-        if given.shape == value.shape and np.allclose(given, value, rtol=1e-4, atol=1e-5):
+        stated = np.asarray(statistic[name], dtype=np.float64).reshape(-1)
+        if stated.shape == value.shape and np.allclose(stated, value, rtol=1e-4, atol=1e-5):
             continue
-        text = f"{name} of {key!r} is {given.tolist()}, the rows give {value.tolist()}"
-        if given.shape == value.shape and is_rounding_error(name, given, value, known):
+        text = f"{name} of {key!r} is {stated.tolist()}, the rows give {value.tolist()}"
+        if stated.shape == value.shape and is_rounding_error(name, stated, value, finite_rows):
             yield _Remark(f"{text}: no more off than sums in single precision")
         else:
             yield text
@@ -422,5 +422,5 @@ def _uncounted_files(root: Path, info: layout.Info, entries: list[EpisodeEntry])
 
 
 def _sides(root: Path, episodes: list[Line]) -> Iterator[str]:
-    ours = of_episodes(layout.read_lines(root / layout.EVA_EPISODES), episodes)
-    yield from orphaned_sidecars(root, {str(line["uuid"]) for line in ours})
+    recorded = of_episodes(layout.read_lines(root / layout.EVA_EPISODES), episodes)
+    yield from orphaned_sidecars(root, {str(line["uuid"]) for line in recorded})

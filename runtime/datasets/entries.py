@@ -87,8 +87,8 @@ def publishing(root: Path) -> int | None:
 
 
 def _brief(indices: list[int]) -> str:
-    said = ", ".join(map(str, indices[:8]))
-    return said if len(indices) <= 8 else f"{said}, ... {indices[-1]}"
+    text = ", ".join(map(str, indices[:8]))
+    return text if len(indices) <= 8 else f"{text}, ... {indices[-1]}"
 
 
 def task_lines(root: Path, info: Info) -> list[Line]:

@@ -83,19 +83,19 @@ def content_uuid(dataset: Dataset, index: int, place: int | None = None) -> str:
     """
     entry, table = dataset.entry(index), dataset.table(index)
     stored = layout.image_keys(dataset.features)
-    held = {
+    digests = {
         name: _digest_column(table[name]) for name in table.column_names if name not in (*_PLACES, *stored)
     }
     for key in stored:
         pictures = StoredImages(f"{entry.data}, {key!r}", table[key].to_pylist(), dataset.root)
         rows = (pictures.row(row) for row in range(len(pictures)))
-        held[key] = _digest(b"" if row is None else row["bytes"] for row in rows)
+        digests[key] = _digest(b"" if row is None else row["bytes"] for row in rows)
     for key, span in entry.videos.items():
         stretch = None if span.start is None else VideoSegment(span.start, entry.length, dataset.fps)
         with VideoFrames(span.path, stretch) as video:
-            held[key] = _digest(video.coded())
-    told = [index if place is None else place, dataset.fps, table.num_rows, sorted(entry.tasks), held]
-    content = json.dumps(told, sort_keys=True, ensure_ascii=True).encode()
+            digests[key] = _digest(video.coded())
+    fields = [index if place is None else place, dataset.fps, table.num_rows, sorted(entry.tasks), digests]
+    content = json.dumps(fields, sort_keys=True, ensure_ascii=True).encode()
     return str(uuid5(NAMESPACE_URL, f"eva-imported-2:{hashlib.sha256(content).hexdigest()}"))
 
 
@@ -133,8 +133,8 @@ def _identity_of_numbers(dataset: Dataset, index: int, place: int) -> str:
         if pa.types.is_floating(column.type):
             values = np.ascontiguousarray(column.to_numpy(zero_copy_only=False), np.float64)
             digests.append(hashlib.sha256(values.tobytes()).hexdigest())
-    told = json.dumps([place, dataset.fps, table.num_rows, sorted(digests)])
-    return str(uuid5(NAMESPACE_URL, f"eva-imported:{hashlib.sha256(told.encode()).hexdigest()}"))
+    text = json.dumps([place, dataset.fps, table.num_rows, sorted(digests)])
+    return str(uuid5(NAMESPACE_URL, f"eva-imported:{hashlib.sha256(text.encode()).hexdigest()}"))
 
 
 def _copy(
@@ -144,7 +144,7 @@ def _copy(
     draft = target.with_name(f".{target.name}.{IMPORTED}")
     try:
         shutil.rmtree(draft, ignore_errors=True)  # left by a crash
-        made = convert(
+        result = convert(
             dataset,
             draft,
             version if version in layout.WRITABLE_VERSIONS else layout.DEFAULT_VERSION,
@@ -155,7 +155,7 @@ def _copy(
         _name(draft, {place: (source, entry.index) for place, entry in enumerate(source.episodes)})
         os.rename(draft, target)
         sync_folder(target.parent)
-        for thing in made.left_out:
+        for thing in result.left_out:
             tell(f"left out: {thing}")
     except OSError as error:
         raise disk_error("importing into", target, error) from error
@@ -165,11 +165,14 @@ def _copy(
 
 def _name(root: Path, sources: Mapping[int, tuple[Dataset, int]] | None = None) -> None:
     """Write a line with a uuid for each episode that has none; `sources` has the episode that each was copied from."""
-    dataset, told = open_dataset(root), {int(line["episode_index"]): line for line in _recorded_lines(root)}
+    dataset, recorded = (
+        open_dataset(root),
+        {int(line["episode_index"]): line for line in _recorded_lines(root)},
+    )
     lines = []
     for entry in dataset.episodes:
         source, index = (sources or {}).get(entry.index, (dataset, entry.index))
-        lines.append(told.get(entry.index) or _line(entry, content_uuid(source, index, entry.index)))
+        lines.append(recorded.get(entry.index) or _line(entry, content_uuid(source, index, entry.index)))
     content = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines)
     write_atomic(root / layout.EVA_EPISODES, content.encode())
 
@@ -187,18 +190,22 @@ def _line(entry: EpisodeEntry, uuid: str) -> dict[str, Any]:
 
 
 def _require_same(dataset: Path, target: Path, tell: ProgressCallback) -> None:
-    source, known, there = open_dataset(dataset), uuids_of(dataset), uuids_of(target)
-    other = RecordingError(f"{target} is there and holds other episodes: import {dataset} under another name")
-    if len(there) != len(source.episodes):
-        raise other
+    source, source_uuids, target_uuids = open_dataset(dataset), uuids_of(dataset), uuids_of(target)
+    conflict = RecordingError(
+        f"{target} is there and holds other episodes: import {dataset} under another name"
+    )
+    if len(target_uuids) != len(source.episodes):
+        raise conflict
     by_numbers = 0
     for place, entry in enumerate(source.episodes):
-        uuid = known.get(entry.index) or content_uuid(source, entry.index, place)
-        if there.get(place) == uuid:
+        uuid = source_uuids.get(entry.index) or content_uuid(source, entry.index, place)
+        if target_uuids.get(place) == uuid:
             continue
         by_numbers += 1
-        if entry.index in known or there.get(place) != _identity_of_numbers(source, entry.index, place):
-            raise other
+        if entry.index in source_uuids or target_uuids.get(place) != _identity_of_numbers(
+            source, entry.index, place
+        ):
+            raise conflict
     if by_numbers:
         tell(
             f"{target} was imported by a version that compared numbers alone, and is taken as it is: where pictures "

@@ -43,8 +43,8 @@ class ExtraStreams:
 
     def row(self, index: int) -> dict[str, Any]:
         """Return the vectors of row `index` by stream, as arguments of a Row; a vector of only NaN becomes None."""
-        given = {stream: vectors[index] for stream, vectors in self.vectors.items()}
-        return {stream: None if np.isnan(vector).all() else vector for stream, vector in given.items()}
+        row = {stream: vectors[index] for stream, vectors in self.vectors.items()}
+        return {stream: None if np.isnan(vector).all() else vector for stream, vector in row.items()}
 
 
 def read_extra_streams(dataset: Dataset, index: int, state: str) -> ExtraStreams:
@@ -61,13 +61,13 @@ def read_extra_streams(dataset: Dataset, index: int, state: str) -> ExtraStreams
         if column is None:
             continue
         try:
-            told = _pose_names(dataset, column, names) if stream in _POSES else ()
-            vectors[stream] = _read(dataset, index, state, kind, column, len(told))
+            pose_names = _pose_names(dataset, column, names) if stream in _POSES else ()
+            vectors[stream] = _read(dataset, index, state, kind, column, len(pose_names))
         except RecordingError as error:
             left_out.append(f"{column} is left out: {error}")
             continue
         columns[stream] = column
-        names = told or names
+        names = pose_names or names
     return ExtraStreams(vectors, columns, names, left_out)
 
 
@@ -79,18 +79,18 @@ def dimension_names(feature: Mapping[str, Any]) -> list[str]:
     return [str(name) for name in names] if isinstance(names, list) else []
 
 
-def _pose_names(dataset: Dataset, column: str, others: Sequence[str]) -> list[str]:
-    told = dimension_names(dataset.features[column])
-    fields = [name.rpartition(".")[2] for name in told]
-    if not told or fields != list(EEF_FIELDS) * (len(told) // len(EEF_FIELDS)):
+def _pose_names(dataset: Dataset, column: str, expected: Sequence[str]) -> list[str]:
+    pose_names = dimension_names(dataset.features[column])
+    fields = [name.rpartition(".")[2] for name in pose_names]
+    if not pose_names or fields != list(EEF_FIELDS) * (len(pose_names) // len(EEF_FIELDS)):
         raise RecordingError(
-            f"its numbers are called {', '.join(told) or 'nothing'}; allowed: ARM.{', ARM.'.join(EEF_FIELDS)}"
+            f"its numbers are called {', '.join(pose_names) or 'nothing'}; allowed: ARM.{', ARM.'.join(EEF_FIELDS)}"
         )
-    if others and told != list(others):
+    if expected and pose_names != list(expected):
         raise RecordingError(
-            f"its numbers are {', '.join(told)}, those of the measured poses {', '.join(others)}"
+            f"its numbers are {', '.join(pose_names)}, those of the measured poses {', '.join(expected)}"
         )
-    return told
+    return pose_names
 
 
 def _read(dataset: Dataset, index: int, state: str, kind: _Kind, column: str, width: int) -> Float32:

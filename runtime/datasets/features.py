@@ -76,10 +76,10 @@ def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
     shape, names = list(feature.get("shape") or ()), feature.get("names")
     if len(shape) != 3:
         raise RecordingError(f"pictures are declared of shape {shape}, expected height, width and channels")
-    said = [str(name).rstrip("s") for name in names] if isinstance(names, list) else []
-    if {"height", "width"} <= set(said) and len(said) == 3:
-        height, width = (int(shape[said.index(name)]) for name in ("height", "width"))
-        (channels,) = (int(n) for n, name in zip(shape, said, strict=True) if name not in ("height", "width"))
+    axes = [str(name).rstrip("s") for name in names] if isinstance(names, list) else []
+    if {"height", "width"} <= set(axes) and len(axes) == 3:
+        height, width = (int(shape[axes.index(name)]) for name in ("height", "width"))
+        (channels,) = (int(n) for n, name in zip(shape, axes, strict=True) if name not in ("height", "width"))
         return height, width, channels
     first = shape[0] in (1, 3) and shape[2] not in (1, 3, 4)
     height, width, channels = (int(n) for n in (*shape[1:], shape[0])) if first else (int(n) for n in shape)
@@ -88,8 +88,8 @@ def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
 
 def is_depth(feature: Mapping[str, Any]) -> bool:
     """Return True if images measure distances: LeRobot declares one channel, or `is_depth_map`."""
-    told = {**(feature.get("info") or {}), **(feature.get("video_info") or {})}
-    flagged = any(told.get(name) for name in ("is_depth_map", "video.is_depth_map"))
+    info = {**(feature.get("info") or {}), **(feature.get("video_info") or {})}
+    flagged = any(info.get(name) for name in ("is_depth_map", "video.is_depth_map"))
     return flagged or picture_size(feature)[2] == 1
 
 
@@ -136,10 +136,10 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
     dtype, shape = feature["dtype"], list(feature["shape"])
     if dtype == "image":
         return pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    known = (*NUMBERS, "bool", "string")
-    if dtype not in known or 0 in shape:
+    supported = (*NUMBERS, "bool", "string")
+    if dtype not in supported or 0 in shape:
         raise RecordingError(
-            f"feature {key!r} is {dtype!r} of shape {shape}, stored are image and {known} of lengths above 0"
+            f"feature {key!r} is {dtype!r} of shape {shape}, stored are image and {supported} of lengths above 0"
         )
     kind: pa.DataType = pa.type_for_alias(dtype)
     if shape in ([], [1]):
@@ -156,7 +156,11 @@ def is_language(kind: pa.DataType) -> bool:
     import pyarrow as pa
 
     rows = kind.value_type if pa.types.is_list(kind) or pa.types.is_large_list(kind) else None
-    return rows is not None and pa.types.is_struct(rows) and {"role", "content"} <= {one.name for one in rows}
+    return (
+        rows is not None
+        and pa.types.is_struct(rows)
+        and {"role", "content"} <= {field.name for field in rows}
+    )
 
 
 def arrow_schema(
@@ -195,14 +199,14 @@ def feature_differences(
     stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """Return the differences between the features of a dataset and of a new episode, one sentence each."""
-    found = [f"the dataset has no {key!r}" for key in new if key not in stated]
-    found += [f"the episode has no {key!r}" for key in stated if key not in new]
+    differences = [f"the dataset has no {key!r}" for key in new if key not in stated]
+    differences += [f"the episode has no {key!r}" for key in stated if key not in new]
     for key in stated:
         if key not in new:
             continue
-        found += [
+        differences += [
             f"{key!r} has {aspect} {stated[key].get(aspect)} in the dataset, {new[key].get(aspect)} here"
             for aspect in ("dtype", "shape", "names")
             if stated[key].get(aspect) != new[key].get(aspect)
         ]
-    return found
+    return differences

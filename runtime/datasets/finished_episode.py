@@ -61,9 +61,9 @@ class FinishedEpisode:
         """Return column `name` as float32 [N, W], NaN in rows without a value."""
         width = self.episode.layout.width(name)
         column = self._column(name)
-        known = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
+        valid = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
         values = np.full((self.frames, width), np.nan, dtype=np.float32)
-        values[known] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+        values[valid] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
         return values
 
     def finite_vectors(self, name: str) -> Float32:
@@ -85,8 +85,8 @@ class FinishedEpisode:
         Rows without a value are NaN and do not count as such rows.
         """
         values = self.vectors(name)
-        known = np.asarray(self._column(name).is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
-        broken = ~np.isfinite(values) & known[:, None]
+        valid = np.asarray(self._column(name).is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
+        broken = ~np.isfinite(values) & valid[:, None]
         values[broken] = 0.0
         return values, np.any(broken, axis=1)
 

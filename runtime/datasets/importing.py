@@ -57,8 +57,8 @@ class SourceRobot:
                     f"{dataset.root}: {self.state} has {width} numbers, {self.robot} has {len(joints)} joints"
                 )
             return joints
-        told = dimension_names(feature)
-        return told if len(told) == width else [f"{self.state}[{k}]" for k in range(width)]
+        stated = dimension_names(feature)
+        return stated if len(stated) == width else [f"{self.state}[{k}]" for k in range(width)]
 
 
 def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> SourceRobot:
@@ -67,15 +67,15 @@ def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> 
     Raises: RecordingError, whose message names the valid choices.
     """
     vectors = [name for name, feature in dataset.features.items() if _is_vector(feature)]
-    found = state or next((name for name in STATES if name in vectors), "")
-    if found not in vectors:
+    column = state or next((name for name in STATES if name in vectors), "")
+    if column not in vectors:
         raise RecordingError(
-            f"{dataset.root} has no column {found or ' or '.join(STATES)} of measured joints: name one of "
+            f"{dataset.root} has no column {column or ' or '.join(STATES)} of measured joints: name one of "
             f"{', '.join(vectors) or 'none, it has no vectors'}"
         )
     if robot and robot not in robots.robot_names():
         raise RecordingError(f"robot {robot!r} does not exist; there are: {', '.join(robots.robot_names())}")
-    return SourceRobot(found, robot)
+    return SourceRobot(column, robot)
 
 
 def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRobot) -> tuple[str, bool]:
@@ -101,9 +101,9 @@ def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRob
         return uuid, False
     try:
         shutil.rmtree(drafts / uuid, ignore_errors=True)  # left by a crash
-        made = _recorded(dataset, index, uuid, drafts, told, os.path.relpath(dataset.root, episodes.parent))
+        draft = _recorded(dataset, index, uuid, drafts, told, os.path.relpath(dataset.root, episodes.parent))
         episodes.mkdir(parents=True, exist_ok=True)
-        os.rename(made, folder)
+        os.rename(draft, folder)
         sync_folder(episodes)
     except OSError as error:
         raise disk_error("importing into", folder, error) from error
@@ -112,27 +112,27 @@ def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRob
     return uuid, True
 
 
-def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, told: SourceRobot, name: str) -> Path:
+def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, source: SourceRobot, name: str) -> Path:
     keys = [*layout.video_keys(dataset.features), *layout.image_keys(dataset.features)]
     cameras = {key.removeprefix(video_key("")).replace("/", "."): key for key in keys}
     action = ACTION if _is_vector(dataset.features.get(ACTION, {})) else None
-    episode = dataset.episode(index, ColumnMapping(state=told.state, action=action, videos=cameras))
-    beside = read_extra_streams(dataset, index, told.state)
+    episode = dataset.episode(index, ColumnMapping(state=source.state, action=action, videos=cameras))
+    extra = read_extra_streams(dataset, index, source.state)
     settings = RecordingSettings(min_free_bytes=0)
     with ExitStack() as stack:
         pictures = {camera: stack.enter_context(episode.pictures(camera)) for camera in cameras}
-        manifest = _manifest(dataset, episode, uuid, told, name, _sizes(pictures, settings), beside)
+        manifest = _manifest(dataset, episode, uuid, source, name, _sizes(pictures, settings), extra)
         journal = EpisodeJournal(root, settings, patient=True)
         journal.begin(manifest)
         try:
             for row in range(episode.length):
-                shown = {camera: each[row] for camera, each in pictures.items()}
-                journal.append(_row(episode, row, shown, beside))
+                images = {camera: frames[row] for camera, frames in pictures.items()}
+                journal.append(_row(episode, row, images, extra))
                 journal.append(_tick(episode, row))
         except BaseException as error:
             journal.end(Outcome("failed", f"the import of row {row} failed: {error}", time.time()))
             raise
-        reason = "; ".join([f"imported: episode {index} of {name}", *beside.left_out])
+        reason = "; ".join([f"imported: episode {index} of {name}", *extra.left_out])
         journal.end(Outcome("finished", reason, time.time()))
     if losses := journal.pop_lost_cameras():
         raise RecordingError(f"{dataset.root}, episode {index}: {'; '.join(loss.text for loss in losses)}")
@@ -143,12 +143,12 @@ def _manifest(
     dataset: Dataset,
     episode: RecordedEpisode,
     uuid: str,
-    told: SourceRobot,
+    source: SourceRobot,
     name: str,
     sizes: Mapping[str, Any],
-    beside: ExtraStreams,
+    extra: ExtraStreams,
 ) -> dict[str, Any]:
-    joints = told.names(dataset)
+    joints = source.names(dataset)
     own = str(dataset.info.get("robot_type") or "")
     return {
         "format": 1,
@@ -158,16 +158,16 @@ def _manifest(
         "mode": "observe",
         "task": episode.task,
         "robot": {
-            "name": told.robot or own,
+            "name": source.robot or own,
             "joint_names": joints,
-            "eef_names": list(beside.eef_names),
+            "eef_names": list(extra.eef_names),
             "dim": len(joints),
-            "eef_dim": len(beside.eef_names),
+            "eef_dim": len(extra.eef_names),
         },
         "fps": dataset.fps,
         "control_rate": dataset.fps,
         "cameras": sizes,
-        "streams": dict.fromkeys(beside.vectors, True),
+        "streams": dict.fromkeys(extra.vectors, True),
         "capture_streams": [],
         "started_wall": time.time(),
         "started_monotonic": 0.0,
@@ -175,20 +175,20 @@ def _manifest(
         "imported": {
             "dataset": name,
             "index": episode.index,
-            "state": told.state,
-            "robot": told.robot,
-            "columns": dict(beside.columns),
+            "state": source.state,
+            "robot": source.robot,
+            "columns": dict(extra.columns),
         },
     }
 
 
 def _sizes(pictures: Mapping[str, ImageSequence], settings: RecordingSettings) -> dict[str, Any]:
-    given = {camera: (each[0].shape[0], each[0].shape[1]) for camera, each in pictures.items()}
-    sizes = settings.sizes(given)
+    captured = {camera: (frames[0].shape[0], frames[0].shape[1]) for camera, frames in pictures.items()}
+    sizes = settings.sizes(captured)
     return {camera: {"width": width, "height": height} for camera, (height, width) in sizes.items()}
 
 
-def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], beside: ExtraStreams) -> Row:
+def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], extra: ExtraStreams) -> Row:
     return Row(
         index=row,
         step=row,
@@ -199,7 +199,7 @@ def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], beside
         captured={},
         pictures=pictures,
         control_source="unknown",
-        **beside.row(row),
+        **extra.row(row),
     )
 
 

@@ -93,11 +93,11 @@ def _parse(text: str) -> Any:
 
 
 def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
         keys = [key for key, _ in pairs]
         raise ValueError(f"it gives {next(key for key in keys if keys.count(key) > 1)!r} twice")
-    return found
+    return fields
 
 
 def read_info(root: Path) -> dict[str, Any]:

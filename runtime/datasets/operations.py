@@ -91,21 +91,21 @@ def split(
         raise RecordingError(f"{dataset} is to be split into nothing")
     with _locked_datasets([dataset]):
         source = SourceDataset.open(Path(dataset))
-        wanted = {target: source.episode_refs(_unique(indices)) for target, indices in targets.items()}
-        for target in wanted:
+        refs = {target: source.episode_refs(_unique(indices)) for target, indices in targets.items()}
+        for target in refs:
             if target.exists() and any(target.iterdir()):
                 raise RecordingError(f"{target} is there already and not empty")
-        made = version or _written_version(source)
-        done: list[AssemblyResult] = []
+        target_version = version or _written_version(source)
+        results: list[AssemblyResult] = []
         try:
-            for target, parts in wanted.items():
-                said = partial(_of_part, tell, target.name)
-                done.append(assemble(target, made, parts, reencode=reencode, tell=said))
+            for target, parts in refs.items():
+                on_progress = partial(_of_part, tell, target.name)
+                results.append(assemble(target, target_version, parts, reencode=reencode, tell=on_progress))
         except BaseException:  # all parts or none: a remaining part would block the next try
-            for target in list(wanted)[: len(done)]:
+            for target in list(refs)[: len(results)]:
                 shutil.rmtree(target)
             raise
-        return done
+        return results
 
 
 def _of_part(tell: ProgressCallback, name: str, progress: str) -> None:
@@ -152,12 +152,14 @@ def fingerprint(dataset: Path) -> str:
     """
     root = Path(dataset)
     info = layout.read_info(root)
-    told = [
+    stated = [
         [line["episode_index"], line["length"], list(line.get("tasks") or ())]
         for line in episode_lines(root, info)
     ]
-    ours = [[line["episode_index"], line["uuid"]] for line in layout.read_lines(root / layout.EVA_EPISODES)]
-    return hashlib.sha256(json.dumps([told, ours], ensure_ascii=True).encode()).hexdigest()
+    recorded = [
+        [line["episode_index"], line["uuid"]] for line in layout.read_lines(root / layout.EVA_EPISODES)
+    ]
+    return hashlib.sha256(json.dumps([stated, recorded], ensure_ascii=True).encode()).hexdigest()
 
 
 def repair(dataset: Path) -> list[str]:
@@ -182,9 +184,9 @@ def _written_version(source: SourceDataset) -> str:
 
 
 def _unique(indices: Sequence[int]) -> Sequence[int]:
-    twice = sorted({index for index in indices if list(indices).count(index) > 1})
-    if twice:
-        raise RecordingError(f"episodes {twice} are named twice")
+    duplicates = sorted({index for index in indices if list(indices).count(index) > 1})
+    if duplicates:
+        raise RecordingError(f"episodes {duplicates} are named twice")
     return indices
 
 

@@ -82,7 +82,7 @@ def publish(
     """
     if version not in (None, *layout.WRITABLE_VERSIONS):
         raise RecordingError(f"version is {version!r}, published are {layout.WRITABLE_VERSIONS}")
-    given = read_sidecars(sides or {})
+    contents = read_sidecars(sides or {})
     verdict = require_intact(Path(episode))
     journal = read_finished_episode(Path(episode))
     _require_publishable(journal, include_interrupted)
@@ -104,9 +104,9 @@ def publish(
             raise RecordingError(
                 f"{root} is of version {catalog.version}, not {version}: publish to another folder, or convert it"
             )
-        beside = {STREAMS: export_table(journal.folder), **given}
-        done = _publish(journal, catalog, (success, result), version or layout.DEFAULT_VERSION, beside)
-    return replace(done, remark=verdict.text if verdict.state == "unsealed" else "")
+        sidecars = {STREAMS: export_table(journal.folder), **contents}
+        published = _publish(journal, catalog, (success, result), version or layout.DEFAULT_VERSION, sidecars)
+    return replace(published, remark=verdict.text if verdict.state == "unsealed" else "")
 
 
 def never_published(manifest: Mapping[str, object]) -> str:
@@ -130,9 +130,9 @@ def _discarded(journal: FinishedEpisode) -> str:
 
 
 def _require_publishable(journal: FinishedEpisode, include_interrupted: bool) -> None:
-    why = never_published(journal.manifest) or _discarded(journal)
-    if why:
-        raise RecordingError(f"{journal.folder} {why}")
+    reason = never_published(journal.manifest) or _discarded(journal)
+    if reason:
+        raise RecordingError(f"{journal.folder} {reason}")
     invented = int((journal.scalars("control_source") == SIMULATED).sum()) if journal.frames else 0
     if invented:
         raise RecordingError(f"{journal.folder}: {invented} of its rows are actions of a simulated robot")
@@ -154,11 +154,11 @@ def _require_publishable(journal: FinishedEpisode, include_interrupted: bool) ->
 def _publish(
     journal: FinishedEpisode,
     catalog: Catalog,
-    said: tuple[bool | None, Result | None],
+    outcome: tuple[bool | None, Result | None],
     version: str,
-    beside: Mapping[str, bytes],
+    sidecars: Mapping[str, bytes],
 ) -> Published:
-    root, success = catalog.root, said[0]
+    root, success = catalog.root, outcome[0]
     features = _features(journal, _with_success(journal, catalog, success))
     if catalog.info:
         features = without_later(features, catalog.features)
@@ -167,7 +167,7 @@ def _publish(
     index, created = _place(journal, catalog)
     line = catalog.line(index, [journal.task], journal.frames)
     entry = catalog.entry(line)
-    sides = {sidecar_path(root, kind, journal.uuid): content for kind, content in beside.items()}
+    sides = {sidecar_path(root, kind, journal.uuid): content for kind, content in sidecars.items()}
     files = [*(span.path for span in entry.videos.values()), *sides, entry.data]
     with Staging(root, index, files) as staging:
         for path, content in sides.items():
@@ -185,7 +185,7 @@ def _publish(
         )
         write_table(table(columns, features), staging.path(entry.data))
         statistics |= column_statistics(columns, features)
-        catalog = catalog.with_episode(line, statistics, _eva(journal, columns, *said))
+        catalog = catalog.with_episode(line, statistics, _eva(journal, columns, *outcome))
         staging.commit(catalog.documents_before_data(), catalog.documents_after_data())
     return Published(root, index, journal.frames, created)
 
@@ -198,13 +198,13 @@ def _with_success(journal: FinishedEpisode, catalog: Catalog, success: bool | No
     """
     if not catalog.info:
         return success is not None
-    wanted = SUCCESS in catalog.features
-    if wanted and success is None:
+    has_success = SUCCESS in catalog.features
+    if has_success and success is None:
         raise RecordingError(
             f"{catalog.root} says of every episode whether it succeeded ({SUCCESS}), of {journal.folder} "
             "that is not known: give --success or --failure"
         )
-    return wanted
+    return has_success
 
 
 def _features(journal: FinishedEpisode, with_success: bool) -> declared.Features:
@@ -253,12 +253,12 @@ def _eva(
     success.
     """
     manifest = journal.manifest
-    told = ("station", "kind", "mode", "strategy", "started_wall", "configuration_hash", "versions")
+    keys = ("station", "kind", "mode", "strategy", "started_wall", "configuration_hash", "versions")
     return {
         "uuid": journal.uuid,
         "frames": journal.frames,
         "task": journal.task,
-        **{key: manifest[key] for key in told if key in manifest},
+        **{key: manifest[key] for key in keys if key in manifest},
         "simulated": simulated(manifest),
         "outcome": dict(journal.outcome),
         "success": success,

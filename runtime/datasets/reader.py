@@ -104,8 +104,10 @@ class Dataset:
         for listed in self.episodes:
             if listed.index == index:
                 return listed
-        there = f"{self.episodes[0].index} to {self.episodes[-1].index}" if self.episodes else "none"
-        raise RecordingError(f"{self.root} has no episode {index}, there are {len(self.episodes)}: {there}")
+        available = f"{self.episodes[0].index} to {self.episodes[-1].index}" if self.episodes else "none"
+        raise RecordingError(
+            f"{self.root} has no episode {index}, there are {len(self.episodes)}: {available}"
+        )
 
     def episode(self, index: int, mapping: ColumnMapping | None = None) -> RecordedEpisode:
         """Read episode `index` with the columns that `mapping` names. Raises: RecordingError."""
@@ -161,15 +163,15 @@ class Dataset:
         """Return by camera the feature that contains its images."""
         stored = [*layout.video_keys(self.features), *layout.image_keys(self.features)]
         prefix = video_key("")
-        wanted = mapping.videos
-        if wanted is None:
-            wanted = {key.removeprefix(prefix): key for key in stored if key.startswith(prefix)}
-        for camera, key in wanted.items():
+        columns = mapping.videos
+        if columns is None:
+            columns = {key.removeprefix(prefix): key for key in stored if key.startswith(prefix)}
+        for camera, key in columns.items():
             if key not in stored:
                 raise RecordingError(
                     f"{self.root} has no pictures {key!r} for camera {camera!r}, there are {sorted(stored)}"
                 )
-        return dict(wanted)
+        return dict(columns)
 
 
 class _Columns:
@@ -263,11 +265,11 @@ def open_dataset(root: Path | str) -> Dataset:
 
 def _numbered(root: Path, lines: Iterable[Mapping[str, Any]]) -> dict[int, str]:
     """Return the tasks by index. Raises: RecordingError if two tasks have the same index."""
-    found: dict[int, str] = {}
+    tasks: dict[int, str] = {}
     for line in lines:
         number, task = line["task_index"], line["task"]
-        if found.setdefault(number, task) != task:
+        if tasks.setdefault(number, task) != task:
             raise RecordingError(
-                f"{root}: task_index {number} is {found[number]!r} and {task!r}; allowed: one task each"
+                f"{root}: task_index {number} is {tasks[number]!r} and {task!r}; allowed: one task each"
             )
-    return found
+    return tasks

@@ -129,9 +129,9 @@ def _in_order(source: Path, recorded: av.container.InputContainer, frames: int) 
     Raises: RecordingError if the first is no key frame, or decoding order is not presentation order.
     """
     newest: int | None = None
-    taken = 0
+    position = 0
     for packet in recorded.demux(recorded.streams.video[0]):
-        if taken == frames:
+        if position == frames:
             return
         if packet.pts is None:
             continue
@@ -139,8 +139,8 @@ def _in_order(source: Path, recorded: av.container.InputContainer, frames: int) 
             raise RecordingError(f"{source} does not start with a key frame")
         if newest is not None and packet.pts <= newest:
             raise RecordingError(
-                f"{source} has B-frames at frame {taken}: it was not written by our recorder"
+                f"{source} has B-frames at frame {position}: it was not written by our recorder"
             )
         newest = packet.pts
-        taken += 1
+        position += 1
         yield packet

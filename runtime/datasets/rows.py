@@ -31,16 +31,18 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names
             if len(set(names)) < len(names):
-                twice = sorted({name for name in names if names.count(name) > 1})
-                raise RecordingError(f"{path} has more than one column named {', '.join(map(repr, twice))}")
-            wanted = [name for name in names if name not in left_out] if left_out else None
+                duplicates = sorted({name for name in names if names.count(name) > 1})
+                raise RecordingError(
+                    f"{path} has more than one column named {', '.join(map(repr, duplicates))}"
+                )
+            columns = [name for name in names if name not in left_out] if left_out else None
             if episode is None:
-                return file.read(columns=wanted)
+                return file.read(columns=columns)
             if EPISODE not in names:
                 raise RecordingError(
                     f"{path} holds several episodes but has no column {EPISODE}, only {names}"
                 )
-            table = file.read_row_groups(_groups(file.metadata, episode), columns=wanted)
+            table = file.read_row_groups(_groups(file.metadata, episode), columns=columns)
     except (OSError, pa.ArrowException) as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
     import pyarrow.compute as pc
@@ -62,7 +64,7 @@ def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, 
     import pyarrow as pa
 
     column = table.column(name).combine_chunks()
-    known = column.is_valid().to_numpy(zero_copy_only=False)
+    valid = column.is_valid().to_numpy(zero_copy_only=False)
     flat = column.drop_null()
     if len(column) and not len(flat):
         return np.full((len(column), width), np.nan)
@@ -74,11 +76,11 @@ def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, 
     ):
         raise RecordingError(f"{name!r} is stored as {column.type}, expected numbers")
     values = np.asarray(flat.to_numpy(zero_copy_only=False))
-    found = values.reshape(known.sum(), -1) if values.size else np.empty((known.sum(), 0))
-    if known.all():
-        return found
-    rows = np.full((len(known), found.shape[1]), np.nan)
-    rows[known] = found
+    present = values.reshape(valid.sum(), -1) if values.size else np.empty((valid.sum(), 0))
+    if valid.all():
+        return present
+    rows = np.full((len(valid), present.shape[1]), np.nan)
+    rows[valid] = present
     return rows
 
 
@@ -129,7 +131,7 @@ def _groups(metadata: pq.FileMetaData, episode: int) -> list[int]:
         group = metadata.row_group(number)
         columns = (group.column(k) for k in range(group.num_columns))
         column = next(column for column in columns if column.path_in_schema == EPISODE)
-        known = column.statistics
-        if known is None or not known.has_min_max or known.min <= episode <= known.max:
+        statistics = column.statistics
+        if statistics is None or not statistics.has_min_max or statistics.min <= episode <= statistics.max:
             chosen.append(number)
     return chosen

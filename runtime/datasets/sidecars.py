@@ -31,8 +31,8 @@ def sidecar_path(root: Path, kind: str, uuid: str) -> Path:
 
 def sidecar_paths(root: Path, uuid: str) -> dict[str, Path]:
     """Return the existing sidecars of one episode, by kind."""
-    there = {kind: sidecar_path(root, kind, uuid) for kind in SUFFIXES}
-    return {kind: path for kind, path in there.items() if path.is_file()}
+    paths = {kind: sidecar_path(root, kind, uuid) for kind in SUFFIXES}
+    return {kind: path for kind, path in paths.items() if path.is_file()}
 
 
 def read_sidecars(given: Mapping[str, Path]) -> dict[str, bytes]:

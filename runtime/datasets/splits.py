@@ -18,7 +18,7 @@ def episodes_of(name: str, value: Any) -> list[int]:
     try:
         if isinstance(value, str):
             return [index for part in value.split(",") if part.strip() for index in _range(part)]
-        return [index for one in value for index in _range(str(one))]
+        return [index for item in value for index in _range(str(item))]
     except (TypeError, ValueError):
         raise RecordingError(
             f"split {name!r} is {value!r:.80}, expected episodes such as '0:40' or '0:3,5:8'"
@@ -37,16 +37,16 @@ def with_more(splits: Mapping[str, Any], first: int, end: int) -> dict[str, Any]
     """
     if first >= end:
         return dict(splits)
-    known = episodes_of(TRAIN, splits.get(TRAIN, ""))
-    return {**splits, **written({TRAIN: [*known, *range(first, end)]})}
+    training = episodes_of(TRAIN, splits.get(TRAIN, ""))
+    return {**splits, **written({TRAIN: [*training, *range(first, end)]})}
 
 
 def _range(part: str) -> Sequence[int]:
     first, colon, end = part.strip().partition(":")
-    made = range(int(first), int(end)) if colon else [int(first)]
-    if int(first) < 0 or len(made) > 10_000_000:
+    indices = range(int(first), int(end)) if colon else [int(first)]
+    if int(first) < 0 or len(indices) > 10_000_000:
         raise ValueError(part)
-    return made
+    return indices
 
 
 def _text(indices: Sequence[int]) -> str:

@@ -91,8 +91,8 @@ def _take_back(root: Path, index: int, files: list[Path]) -> None:
 
 def require_empty(root: Path) -> None:
     """Raise RecordingError if a folder without info.json contains foreign files."""
-    ours = {FOLDER, LOCK, "data", "videos", "meta", "eva"}
-    foreign = sorted(entry.name for entry in root.iterdir() if entry.name not in ours)
+    own_names = {FOLDER, LOCK, "data", "videos", "meta", "eva"}
+    foreign = sorted(entry.name for entry in root.iterdir() if entry.name not in own_names)
     foreign += [
         str(path.relative_to(root))
         for folder in ("data", "videos", "eva")
@@ -186,16 +186,16 @@ def _draft_prefix(target: Path) -> str:
     return f".{target.absolute().name}.draft-"
 
 
-def _exchange(one: Path, other: Path) -> None:
+def _exchange(first: Path, second: Path) -> None:
     """Exchange two folders in one step, so that both paths exist at any moment. Raises: RecordingError, OSError."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.renameat2(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _RENAME_EXCHANGE):
+    if libc.renameat2(_HERE, os.fsencode(first), _HERE, os.fsencode(second), _RENAME_EXCHANGE):
         number = ctypes.get_errno()
         if number in (errno.EINVAL, errno.ENOSYS):
             raise RecordingError(
-                f"the file system of {other} cannot exchange folders: write the result to another folder"
+                f"the file system of {second} cannot exchange folders: write the result to another folder"
             )
-        raise OSError(number, os.strerror(number), str(other))
+        raise OSError(number, os.strerror(number), str(second))
 
 
 class Staging:

@@ -27,17 +27,17 @@ def column_statistic(values: NDArray[Any]) -> Statistic | None:
     The standard deviation is that of the population.
     """
     rows = values if values.ndim > 1 else values.reshape(-1, 1)
-    known = rows[finite(rows)]
-    if not known.size:
+    finite_rows = rows[finite(rows)]
+    if not finite_rows.size:
         return None
-    exact = known.astype(np.float64)
+    exact = finite_rows.astype(np.float64)
     quantiles = np.quantile(exact, list(QUANTILES.values()), axis=0)
     return {
-        "min": known.min(axis=0).tolist(),
-        "max": known.max(axis=0).tolist(),
+        "min": finite_rows.min(axis=0).tolist(),
+        "max": finite_rows.max(axis=0).tolist(),
         "mean": exact.mean(axis=0).tolist(),
         "std": exact.std(axis=0).tolist(),
-        "count": [len(known)],
+        "count": [len(finite_rows)],
         **dict(zip(QUANTILES, quantiles.tolist(), strict=True)),
     }
 
@@ -80,15 +80,15 @@ def video_statistic(path: Path, frames: int) -> Statistic:
     """
     import av
 
-    wanted = set(np.linspace(0, frames - 1, min(frames, SAMPLED_PICTURES)).round().astype(int).tolist())
+    sampled = set(np.linspace(0, frames - 1, min(frames, SAMPLED_PICTURES)).round().astype(int).tolist())
     sums, deep = _Histogram(), _Deep()
     decoded = 0
     try:
         with open_video(path) as container:
             for frame in container.decode(video=0):
-                if decoded in wanted:
-                    (bits, *others) = (component.bits for component in frame.format.components)
-                    if bits > 8 and not others:
+                if decoded in sampled:
+                    (bits, *further_bits) = (component.bits for component in frame.format.components)
+                    if bits > 8 and not further_bits:
                         deep.add(frame.to_ndarray()[::2, ::2] / (2.0**bits - 1))
                     else:
                         sums.add(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)[::2, ::2])
@@ -109,17 +109,17 @@ def picture_statistic(pictures: StoredImages) -> Statistic | None:
     None if all images are missing or no value is finite. Missing images are skipped. Depth of 16 bits is divided by
     65535, floats are used unchanged.
     """
-    there = [number for number in range(len(pictures)) if not pictures.is_missing(number)]
+    present = [number for number in range(len(pictures)) if not pictures.is_missing(number)]
     sums, deep = _Histogram(), _Deep()
     for place in np.unique(
-        np.linspace(0, len(there) - 1, min(len(there), SAMPLED_PICTURES)).round().astype(int)
+        np.linspace(0, len(present) - 1, min(len(present), SAMPLED_PICTURES)).round().astype(int)
     ):
-        depth = pictures.depth(there[place])
+        depth = pictures.depth(present[place])
         if depth is not None:
             deep.add(depth[::2, ::2])
         else:
-            sums.add(pictures[there[place]][::2, ::2])
-    return (deep.statistic() if deep else sums.statistic()) if there else None
+            sums.add(pictures[present[place]][::2, ::2])
+    return (deep.statistic() if deep else sums.statistic()) if present else None
 
 
 class _Deep:

@@ -159,12 +159,12 @@ class VideoFrames(ImageSequence):
 
     def coded(self) -> Iterator[bytes]:
         """Yield the frames' packets as stored, in coded order; reading an image afterwards requires a seek."""
-        wanted = set(self._times)
+        times = set(self._times)
         self._upcoming = None
         try:
             self._container.seek(self._key_before(0), stream=self._stream)
             for packet in self._packets():
-                if packet.pts in wanted:
+                if packet.pts in times:
                     yield bytes(packet)
         except self._errors as error:
             raise RecordingError(f"{self._path} cannot be read: {error}") from error
@@ -177,8 +177,8 @@ class VideoFrames(ImageSequence):
     @property
     def is_deep(self) -> bool:
         """True if the video is depth: one component of more than 8 bits."""
-        given = self._stream.codec_context.format
-        return given is not None and [part.bits > 8 for part in given.components] == [True]
+        pixel_format = self._stream.codec_context.format
+        return pixel_format is not None and [part.bits > 8 for part in pixel_format.components] == [True]
 
     def __len__(self) -> int:
         return len(self._times)
@@ -268,8 +268,8 @@ def to_rgb(image: Image.Image) -> UInt8:
     depth = _depth(image)
     if depth is None:
         return np.array(image.convert("RGB"), dtype=np.uint8)
-    known = np.where(np.isfinite(depth), depth, 0.0)
-    grey = np.clip(known * (255.0 / max(known.max(), 1e-9)), 0, 255).round().astype(np.uint8)
+    finite_depth = np.where(np.isfinite(depth), depth, 0.0)
+    grey = np.clip(finite_depth * (255.0 / max(finite_depth.max(), 1e-9)), 0, 255).round().astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=2)
 
 
