@@ -48,10 +48,10 @@ class StationClient:
 
     def status(self, timeout: float = 2.0) -> dict[str, Any]:
         """Return the station's snapshot. Raises: TransportError if the station does not answer."""
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         data = complete_state_meaning(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
         self._boot, self._sequence = data["boot"], data["sequence"]
-        self._clock_offset = data["clock"] - asked
+        self._clock_offset = data["clock"] - requested_at
         return data
 
     def events_since(self, number: int) -> list[dict[str, Any]]:

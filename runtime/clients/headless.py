@@ -241,13 +241,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="runtime.clients.headless", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
     parser.add_argument("--boot", required=True)
-    given = parser.parse_args()
+    options = parser.parse_args()
     log.configure_logging("headless")
     settings = loader.resolve_deployment(
-        json.loads(Path(given.resolved).read_text("utf-8")), {}, given.resolved
+        json.loads(Path(options.resolved).read_text("utf-8")), {}, options.resolved
     ).deployment
     station_dir = settings.station_dir
-    client = StationClient(station_dir, holder=f"headless:{given.boot}")
+    client = StationClient(station_dir, holder=f"headless:{options.boot}")
     try:
         result = run_headless(settings, client)
     except RuntimeFault as fault:

@@ -38,9 +38,9 @@ _AGAIN_S = 1.0
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until a signal or the supervisor's end; return the exit code, 2 if the station is unknown."""
-    given = _parser().parse_args(arguments)
+    options = _parser().parse_args(arguments)
     log.configure_logging("channel")
-    station_dir = data_folder(given.data_dir) / "stations" / given.station
+    station_dir = data_folder(options.data_dir) / "stations" / options.station
     try:
         settings = _settings(station_dir)
     except RuntimeFault as fault:
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ended: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: ended.append(number))
-    lifeline = Lifeline() if given.lifeline else None
+    lifeline = Lifeline() if options.lifeline else None
     serve(station_dir, settings, lambda: bool(ended) or (lifeline is not None and lifeline.is_cut))
     return 0
 
@@ -91,7 +91,7 @@ def serve(station_dir: Path, settings: ControlChannelSettings, ended: Callable[[
 def _open(
     station_dir: Path, settings: ControlChannelSettings, names: HolderNames, ended: Callable[[], bool]
 ) -> ChannelServer | None:
-    told = ""
+    logged = ""
     while not ended():
         try:
             return ChannelServer(
@@ -102,9 +102,9 @@ def _open(
                 lambda holder: StationClient(station_dir, holder),
             )
         except TransportError as fault:
-            if str(fault) != told:
+            if str(fault) != logged:
                 _log.error("%s; tried again every second", fault)
-            told = str(fault)
+            logged = str(fault)
             time.sleep(_AGAIN_S)
     return None
 

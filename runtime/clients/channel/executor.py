@@ -53,9 +53,9 @@ class CommandExecutor:
         if message.form == "query":
             return self._run_query(script, message)
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "", "done")
-        known = self._outcomes.get(outcome.id)
-        if known is not None and known.result != "unknown":
-            return self._repeated(message, known, script)
+        previous = self._outcomes.get(outcome.id)
+        if previous is not None and previous.result != "unknown":
+            return self._repeated(message, previous, script)
         data: Mapping[str, Any] = {}
         try:
             data = (self._verb if message.form == "cmd" else self._run_command)(script, message, outcome)
@@ -68,13 +68,13 @@ class CommandExecutor:
         special = dict(data) if message.name == "tab_switch" else {}
         return json_answers.command_answer(message, outcome, data, self._state(script, outcome)) | special
 
-    def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
+    def _repeated(self, message: Message, previous: Outcome, script: Script) -> dict[str, Any]:
         """Answer a repeated command with the outcome of its first execution, as far as it is known now."""
-        if known.said != message.name:
-            why = f"its id was given to {known.said!r} before"
-            other = Outcome(known.id, message.name, "", "refused", why)
-            return json_answers.command_answer(message, other, {}, None)
-        return json_answers.command_answer(message, known, {}, self._state(script, known))
+        if previous.said != message.name:
+            reason = f"its id was given to {previous.said!r} before"
+            refusal = Outcome(previous.id, message.name, "", "refused", reason)
+            return json_answers.command_answer(message, refusal, {}, None)
+        return json_answers.command_answer(message, previous, {}, self._state(script, previous))
 
     def _state(self, script: Script, outcome: Outcome) -> str | None:
         """Return the station's state after a command.
@@ -120,14 +120,14 @@ class CommandExecutor:
         client = script.client
         with _refused_if_unreachable():
             scene = VerbContext(message, client.status(), script.selection, lambda: _commanded(client))
-            made = commands_for_verb(scene)
-        told: Mapping[str, Any] = made.told
-        for number, (kind, arguments) in enumerate(made.steps, start=1):
-            last = number == len(made.steps)
-            told = self._send_command(script, kind, arguments, outcome if last else None) or told
-        script.selection.choose(**made.chosen)
-        outcome.explain(made.note)
-        return told
+            sequence = commands_for_verb(scene)
+        reply: Mapping[str, Any] = sequence.told
+        for number, (kind, arguments) in enumerate(sequence.steps, start=1):
+            last = number == len(sequence.steps)
+            reply = self._send_command(script, kind, arguments, outcome if last else None) or reply
+        script.selection.choose(**sequence.chosen)
+        outcome.explain(sequence.note)
+        return reply
 
     def _run_command(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
         """Execute a command of EVA Web; return the data of the answer."""
@@ -217,16 +217,16 @@ class CommandExecutor:
         return script.client.events_since(since)
 
     def _result(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
-        given = fields.get("id")
+        identity = fields.get("id")
         self._poll_outcomes()
-        found = self._outcomes.get(given) if isinstance(given, str) else None
-        if found is None:
-            raise UnsupportedVerb(f"id = {given!r:.80}: no command of that id is remembered")
-        return found.to_dict
+        result = self._outcomes.get(identity) if isinstance(identity, str) else None
+        if result is None:
+            raise UnsupportedVerb(f"id = {identity!r:.80}: no command of that id is remembered")
+        return result.to_dict
 
     def _commands(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
         return {
-            "cmd": {f"web:{verb}": what.description for verb, what in VERBS.items()},
+            "cmd": {f"web:{verb}": entry.description for verb, entry in VERBS.items()},
             "command": list(OWN),
         }
 

@@ -56,6 +56,6 @@ class HolderNames:
         return commanded or message.form != "query" or waits
 
 
-def _forget(known: dict[bytes, int] | dict[bytes, bool]) -> None:
-    if len(known) > _CONNECTIONS:
-        del known[next(iter(known))]
+def _forget(cached: dict[bytes, int] | dict[bytes, bool]) -> None:
+    if len(cached) > _CONNECTIONS:
+        del cached[next(iter(cached))]

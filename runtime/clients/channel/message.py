@@ -51,8 +51,8 @@ def read(frames: list[bytes]) -> Message:
     Raises: Malformed, but never for a press of the e-stop.
     """
     for frame in frames:
-        if (said := pressing.parse_json_press(frame, "command", "cmd")) is not None:
-            return _press(said)
+        if (press := pressing.parse_json_press(frame, "command", "cmd")) is not None:
+            return _press(press)
     fields = _object(frames)
     client, identity = _client(fields), _identity(fields)
     if "query" in fields:
@@ -68,21 +68,21 @@ def read(frames: list[bytes]) -> Message:
     raise Malformed("message must carry 'cmd' or 'query' (or 'command')")
 
 
-def _press(said: Mapping[str, Any]) -> Message:
-    """Return the press of the e-stop in `said`; its invalid fields are ignored, and `arguments` has the reason."""
-    form: Literal["cmd", "command"] = "cmd" if isinstance(said.get("cmd"), str) else "command"
-    word = said.get(form)
+def _press(message: Mapping[str, Any]) -> Message:
+    """Return the press of the e-stop in `message`; its invalid fields are ignored, and `arguments` has the reason."""
+    form: Literal["cmd", "command"] = "cmd" if isinstance(message.get("cmd"), str) else "command"
+    word = message.get(form)
     named = word if isinstance(word, str) else pressing.NAME
     reason = named.partition(f"{pressing.NAME}:")[2] or "over the control channel"
-    arguments = {"why": pressing.json_reason(said, pressing.sanitize_text(reason))}
+    arguments = {"why": pressing.json_reason(message, pressing.sanitize_text(reason))}
     fields: dict[str, Any] = {form: named[:_LONGEST_NAME]}
-    client, identity = _or_none(_client, said), _or_none(_identity, said)
+    client, identity = _or_none(_client, message), _or_none(_identity, message)
     return Message(form, pressing.NAME, fields, None, arguments, client, identity)
 
 
-def _or_none(read: Callable[[Mapping[str, Any]], str], said: Mapping[str, Any]) -> str:
+def _or_none(read: Callable[[Mapping[str, Any]], str], fields: Mapping[str, Any]) -> str:
     try:
-        return read(said)
+        return read(fields)
     except Malformed:
         return ""
 
@@ -93,12 +93,12 @@ def _object(frames: list[bytes]) -> dict[str, Any]:
     if len(frames[0]) > LARGEST:
         raise Malformed(f"recv failed: {len(frames[0])} bytes; allowed: at most {LARGEST}")
     try:
-        found = json.loads(frames[0].decode("utf-8"), parse_constant=_no_number)
+        parsed = json.loads(frames[0].decode("utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # JSON and UTF-8 alike
         raise Malformed(f"recv failed: not JSON in UTF-8: {error}") from None
-    if not isinstance(found, dict):
+    if not isinstance(parsed, dict):
         raise Malformed("message must be a JSON object")
-    return found
+    return parsed
 
 
 def _no_number(word: str) -> NoReturn:
@@ -112,10 +112,10 @@ def _text_field(fields: Mapping[str, Any], key: str) -> str:
     return word
 
 
-def _verb(said: object) -> tuple[str, str | None]:
-    if not isinstance(said, str) or not said.startswith(_PREFIX):
-        raise Malformed(f"command must start with 'web:', got {said!r:.80}")
-    verb, colon, argument = said.removeprefix(_PREFIX).partition(":")
+def _verb(text: object) -> tuple[str, str | None]:
+    if not isinstance(text, str) or not text.startswith(_PREFIX):
+        raise Malformed(f"command must start with 'web:', got {text!r:.80}")
+    verb, colon, argument = text.removeprefix(_PREFIX).partition(":")
     return verb, argument if colon else None
 
 
@@ -143,10 +143,10 @@ def _identity(fields: Mapping[str, Any]) -> str:
 
     A plain name does not count, because two scripts could use it by accident.
     """
-    given = fields.get("id", "")
-    if given == "":
+    value = fields.get("id", "")
+    if value == "":
         return ""
     try:
-        return str(uuid.UUID(given))
+        return str(uuid.UUID(value))
     except (ValueError, TypeError, AttributeError):
-        raise Malformed(f"id = {given!r:.80}: must be a UUID, or absent") from None
+        raise Malformed(f"id = {value!r:.80}: must be a UUID, or absent") from None

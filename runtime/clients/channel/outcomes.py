@@ -102,9 +102,9 @@ class Outcome:
         return self.calm_since is not None and step - self.calm_since >= CALM_TICKS
 
     def _read_events(self, status: dict[str, Any], events_since: Events) -> None:
-        heard = self.events[-1]["number"] if self.events else self.before["newest_event"]
-        if status["newest_event"] > heard:
-            self.events.extend(events_since(heard))
+        newest = self.events[-1]["number"] if self.events else self.before["newest_event"]
+        if status["newest_event"] > newest:
+            self.events.extend(events_since(newest))
 
     def _end(self, result: str, reason: str) -> None:
         self.result, self.reason, self.before, self.events = result, reason, {}, []

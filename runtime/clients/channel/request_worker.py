@@ -106,9 +106,9 @@ class RequestWorker:
                 del self._waiting[connection]
 
     def _answer(self, job: Job) -> dict[str, Any]:
-        why = self._void(job)
-        if why:
-            return json_answers.error_answer(why) | job.message.echo | {"result": "refused"}
+        reason = self._void(job)
+        if reason:
+            return json_answers.error_answer(reason) | job.message.echo | {"result": "refused"}
         try:
             return self._clerk.answer(job.holder, job.message)
         except Exception as error:  # no message may end the channel

@@ -29,8 +29,8 @@ class ScriptSelection:
     @property
     def setup(self) -> dict[str, Any]:
         """Arguments of a set-up with these choices."""
-        wanted = {"task": self.task, "strategy": self.strategy or None}
-        return {name: value for name, value in wanted.items() if value is not None}
+        selected = {"task": self.task, "strategy": self.strategy or None}
+        return {name: value for name, value in selected.items() if value is not None}
 
     @property
     def run(self) -> dict[str, Any]:
@@ -112,13 +112,13 @@ class Scripts:
         """Return the script of that holder; create it if it is new."""
         script = self._known.pop(holder, None) or Script(self._open(holder))
         self._known[holder] = script
-        for name in [name for name, other in self._known.items() if not other.holds][:-KEPT]:
+        for name in [name for name, cached in self._known.items() if not cached.holds][:-KEPT]:
             self._known.pop(name).close()
         return script
 
     def poll(self) -> list[str]:
         """Renew leases of active scripts, end those of silent scripts; return a sentence for each that ended."""
-        told = []
+        texts = []
         for holder, script in self._known.items():
             if not script.holds:
                 continue
@@ -128,15 +128,15 @@ class Scripts:
                     script.client.renew()
                     continue
                 script.client.release()
-                told.append(f"{holder}: no message for {silence:.1f} s; its lease has ended")
+                texts.append(f"{holder}: no message for {silence:.1f} s; its lease has ended")
             except TransportError as fault:  # the lease of an unreachable station expires by itself
                 if silence <= self._silence:
                     continue
-                told.append(f"{holder}: {fault}")
+                texts.append(f"{holder}: {fault}")
             except Refused as refusal:
-                told.append(f"{holder} has the lease no longer: {refusal}")
+                texts.append(f"{holder} has the lease no longer: {refusal}")
             script.mark_lease_lost()
-        return told
+        return texts
 
     def close(self) -> None:
         """Close all clients; leases still held expire by themselves."""

@@ -97,8 +97,8 @@ class ChannelServer:
         lane = self._lane_of(message)
         if not lane.submit(Job(address, holder, message, time.monotonic(), self._stops)):
             under_way = "so many presses are under way already that this one adds nothing"
-            why = under_way if is_estop(message) else "too many commands wait: not carried out"
-            self._send([*address, json_answers.dumps(json_answers.error_answer(why) | message.echo)])
+            reason = under_way if is_estop(message) else "too many commands wait: not carried out"
+            self._send([*address, json_answers.dumps(json_answers.error_answer(reason) | message.echo)])
 
     def _lane_of(self, message: Message) -> RequestWorker:
         if not is_estop(message) and not is_stop(message):

@@ -61,10 +61,10 @@ class StopHandler:
         """
         client = self._open(holder)
         try:
-            held = client.status()["lease"]["holder"]
-            if held != holder and self._lives.is_known(held):
+            lease_holder = client.status()["lease"]["holder"]
+            if lease_holder != holder and self._lives.is_known(lease_holder):
                 client.close()
-                client = self._open(held)
+                client = self._open(lease_holder)
             client.claim()
             client.status()
             client.send_command(kind, {})

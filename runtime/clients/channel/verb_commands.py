@@ -63,27 +63,27 @@ class VerbContext:
 
     def text_argument(self, key: str = "") -> str:
         """Return the required argument; the message's field `key` takes precedence. Raises: UnsupportedVerb."""
-        said = self.message.fields.get(key, self.message.argument) if key else self.message.argument
-        if not isinstance(said, str) or not said.strip():
+        value = self.message.fields.get(key, self.message.argument) if key else self.message.argument
+        if not isinstance(value, str) or not value.strip():
             self.refuse(f"needs {f'{key!r} in the message, or ' if key else ''}an argument after a colon")
-        return said.strip()
+        return value.strip()
 
     def choice_argument(self, *allowed: str) -> str:
         """Return the argument if it is one of `allowed`. Raises: UnsupportedVerb."""
-        said = self.text_argument()
-        if said not in allowed:
-            self.refuse(f"{said!r:.80} is none of {', '.join(allowed)}")
-        return said
+        choice = self.text_argument()
+        if choice not in allowed:
+            self.refuse(f"{choice!r:.80} is none of {', '.join(allowed)}")
+        return choice
 
     def table(self) -> dict[str, Any]:
         """Parse the argument as a JSON object. Raises: UnsupportedVerb."""
         try:
-            found = json.loads(self.text_argument())
+            table = json.loads(self.text_argument())
         except (ValueError, RecursionError) as error:
             self.refuse(f"its argument is not JSON: {error}")
-        if not isinstance(found, dict):
-            self.refuse(f"its argument is a JSON object; given {found!r:.80}")
-        return found
+        if not isinstance(table, dict):
+            self.refuse(f"its argument is a JSON object; given {table!r:.80}")
+        return table
 
     def joints(self, values: object) -> list[float]:
         """Check for one finite number per joint; return them as floats [D]. Raises: UnsupportedVerb."""
@@ -99,12 +99,12 @@ class VerbContext:
     def number(self, said: str) -> float:
         """Parse a finite number. Raises: UnsupportedVerb."""
         try:
-            found = float(said)
+            number = float(said)
         except ValueError:
-            found = math.nan
-        if not math.isfinite(found):
+            number = math.nan
+        if not math.isfinite(number):
             self.refuse(f"{said!r:.80} is no finite number")
-        return found
+        return number
 
     def arm(self, side: str) -> str:
         """Return the name of the arm with a gripper that `side` names, in full or by its beginning.
@@ -113,9 +113,9 @@ class VerbContext:
         """
         arms: list[str] = self.status["facts"]["arms"]
         grips = [arm for arm in arms if arm in self.status["grippers"]]
-        found = [arm for arm in grips if side and (arm == side or arm.startswith(side))]
-        if not found and side in ("l", "r", "left", "right") and len(grips) == 1:
-            found = grips
-        if len(found) != 1:
+        matches = [arm for arm in grips if side and (arm == side or arm.startswith(side))]
+        if not matches and side in ("l", "r", "left", "right") and len(grips) == 1:
+            matches = grips
+        if len(matches) != 1:
             self.refuse(f"{side!r:.80} is no gripper of this robot; allowed: {', '.join(grips) or 'none'}")
-        return found[0]
+        return matches[0]

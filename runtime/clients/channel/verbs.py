@@ -50,11 +50,11 @@ def _stopping(kind: str) -> Callable[[VerbContext], CommandSequence]:
     return lambda scene: CommandSequence(((kind, {}),))
 
 
-def _unsupported(why: str) -> Verb:
+def _unsupported(reason: str) -> Verb:
     def does(scene: VerbContext) -> CommandSequence:
-        scene.refuse(why)
+        scene.refuse(reason)
 
-    return Verb(does, f"refused: {why}")
+    return Verb(does, f"refused: {reason}")
 
 
 # --- set-up and runs -----------------------------------------------------------------------------------------
@@ -150,8 +150,8 @@ def _parameters(scene: VerbContext) -> CommandSequence:
 
 
 def _target(scene: VerbContext) -> CommandSequence:
-    said = [scene.number(part) for part in scene.text_argument().split(",")]
-    target = scene.joints(said)
+    numbers = [scene.number(part) for part in scene.text_argument().split(",")]
+    target = scene.joints(numbers)
     return CommandSequence(chosen={"target": target}, note="web:manual_send goes there")
 
 
@@ -169,10 +169,10 @@ def _home(scene: VerbContext) -> CommandSequence:
 
 
 def _init_move(scene: VerbContext) -> CommandSequence:
-    said = scene.table()
-    if set(said) != {"qpos"}:
-        scene.refuse(f'its argument is {{"qpos": [..]}}; given the keys {sorted(said)!r:.80}')
-    return CommandSequence((("move", {"joints": scene.joints(said["qpos"])}),))
+    table = scene.table()
+    if set(table) != {"qpos"}:
+        scene.refuse(f'its argument is {{"qpos": [..]}}; given the keys {sorted(table)!r:.80}')
+    return CommandSequence((("move", {"joints": scene.joints(table["qpos"])}),))
 
 
 def _init_gripper(scene: VerbContext) -> CommandSequence:
@@ -183,13 +183,13 @@ def _init_gripper(scene: VerbContext) -> CommandSequence:
 
 
 def _gripper(scene: VerbContext) -> CommandSequence:
-    side, *rest = scene.text_argument().split(":")
+    side, *parts = scene.text_argument().split(":")
     arm = scene.arm(side)
-    if len(rest) == 1 and rest[0] not in ("open", "close"):
-        return _gripper_at(scene, arm, scene.number(rest[0]))
-    if len(rest) != 2 or rest[0] not in ("open", "close") or rest[1] not in ("0", "1"):
+    if len(parts) == 1 and parts[0] not in ("open", "close"):
+        return _gripper_at(scene, arm, scene.number(parts[0]))
+    if len(parts) != 2 or parts[0] not in ("open", "close") or parts[1] not in ("0", "1"):
         scene.refuse("allowed: SIDE:open:1, SIDE:close:1, SIDE:open:0, SIDE:close:0, SIDE:NUMBER")
-    return CommandSequence((("gripper", {"action": rest[0] if rest[1] == "1" else "unlock", "arm": arm}),))
+    return CommandSequence((("gripper", {"action": parts[0] if parts[1] == "1" else "unlock", "arm": arm}),))
 
 
 def _gripper_at(scene: VerbContext, arm: str, value: float) -> CommandSequence:

@@ -41,19 +41,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 2 if the deployment has no panel or the PIN cannot be set.
     """
-    given = _parser().parse_args(arguments)
-    data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
-    station_dir = data / "stations" / given.station
+    options = _parser().parse_args(arguments)
+    data = Path(options.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+    station_dir = data / "stations" / options.station
     try:
-        if given.set_pin:
+        if options.set_pin:
             PinFile(station_dir).set(_prompt_pin())
-            print(f"the panel of {given.station} has another PIN: who had given the former one gives it anew")
+            print(
+                f"the panel of {options.station} has another PIN: who had given the former one gives it anew"
+            )
             return 0
         logs.configure_logging("panel")
         ended: list[int] = []
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: ended.append(number))
-        lifeline = Lifeline() if given.lifeline else None
+        lifeline = Lifeline() if options.lifeline else None
         serve(station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.is_cut))
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
@@ -89,14 +91,14 @@ def serve(station_dir: Path, ended: Callable[[], bool]) -> None:
 
 
 def _open(panel: Panel, ended: Callable[[], bool]) -> PanelServer | None:
-    told = ""
+    logged = ""
     while not ended():
         try:
             return panel.server()
         except TransportError as fault:
-            if str(fault) != told:
+            if str(fault) != logged:
                 log.error("%s; tried again every second", fault)
-            told = str(fault)
+            logged = str(fault)
             time.sleep(_AGAIN_S)
     return None
 

@@ -38,32 +38,32 @@ class PinFile:
                 f"the PIN has {len(pin)} characters; allowed: {SHORTEST} to {LONGEST}, digits or any others"
             )
         salt = secrets.token_bytes(16)
-        kept = {**_COST, "salt": salt.hex(), "hash": _hashed(pin, salt, **_COST).hex()}
+        fields = {**_COST, "salt": salt.hex(), "hash": _hashed(pin, salt, **_COST).hex()}
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(self.path, json.dumps(kept).encode(), 0o600)
+        write_durably(self.path, json.dumps(fields).encode(), 0o600)
 
     @property
     def version(self) -> tuple[int, int]:
         """Identity of the stored PIN, which changes with each `set`; (0, 0) if there is none."""
         try:
-            found = self.path.stat()
+            status = self.path.stat()
         except OSError:
             return (0, 0)
-        return found.st_ino, found.st_mtime_ns
+        return status.st_ino, status.st_mtime_ns
 
     def matches(self, pin: str) -> bool:
         """Return True if the PIN is right. Raises: ConfigurationError if none is set or its file is invalid."""
         try:
             if self.path.stat().st_mode & _OTHERS:
                 raise ConfigurationError(f"{self.path} can be read by others; allowed: 0600; set a PIN again")
-            kept = json.loads(self.path.read_text("utf-8"))
-            salt, wanted = bytes.fromhex(kept["salt"]), bytes.fromhex(kept["hash"])
-            made = _hashed(pin, salt, int(kept["n"]), int(kept["r"]), int(kept["p"]))
+            fields = json.loads(self.path.read_text("utf-8"))
+            salt, expected = bytes.fromhex(fields["salt"]), bytes.fromhex(fields["hash"])
+            computed = _hashed(pin, salt, int(fields["n"]), int(fields["r"]), int(fields["p"]))
         except FileNotFoundError:
             raise ConfigurationError("no PIN is set on the station's computer") from None
         except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
             raise ConfigurationError(f"{self.path} cannot be used ({error}): set a PIN again") from None
-        return hmac.compare_digest(made, wanted)
+        return hmac.compare_digest(computed, expected)
 
 
 def _hashed(pin: str, salt: bytes, n: int, r: int, p: int) -> bytes:

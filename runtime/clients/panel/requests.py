@@ -117,15 +117,15 @@ class PanelRequests(BaseHTTPRequestHandler):
         self._connection.presses = path == "/estop"
         if not self._known_host() or not self._own_origin():
             return
-        said = self._posted_fields()
+        fields = self._posted_fields()
         if path == "/estop":
-            self._send_result(self._panel.stops.press(self._connection.source, _uuid(said)))
+            self._send_result(self._panel.stops.press(self._connection.source, _uuid(fields)))
         elif path == "/stop" and self._has_pin():
-            self._send_result(self._panel.stops.stop(self._connection.source, _uuid(said)))
+            self._send_result(self._panel.stops.stop(self._connection.source, _uuid(fields)))
         elif path == "/stop":
             self._refuse(HTTPStatus.UNAUTHORIZED, "give the PIN first: the E-STOP needs none")
         elif path == "/pin":
-            self._enter(str(said.get("pin") or ""))
+            self._enter(str(fields.get("pin") or ""))
         elif path == "/leave":
             self._panel.sessions.end(self._secret())
             self._json(HTTPStatus.OK, {}, self._cookie("", 0))
@@ -144,8 +144,8 @@ class PanelRequests(BaseHTTPRequestHandler):
     def _picture(self, camera: str) -> None:
         self._panel.watch.note_viewer()
         picture = self._panel.watch.picture(camera)
-        seen = parse_qs(urlsplit(self.path).query).get("seen", [""])[0]
-        if picture is None or seen == str(picture.number):
+        displayed = parse_qs(urlsplit(self.path).query).get("seen", [""])[0]
+        if picture is None or displayed == str(picture.number):
             self._answer(HTTPStatus.NO_CONTENT, b"")
         else:
             self._answer(HTTPStatus.OK, picture.jpeg, "image/jpeg", {"X-Number": str(picture.number)})
@@ -162,13 +162,13 @@ class PanelRequests(BaseHTTPRequestHandler):
         log.info("the PIN was given from %s", source)
         self._json(HTTPStatus.OK, {}, self._cookie(secret, int(LASTS_S)))
 
-    def _send_result(self, told: StopResult) -> None:
+    def _send_result(self, result: StopResult) -> None:
         """Answer with JSON to our script, with text to a form that is used without the script."""
-        status = HTTPStatus.OK if told.done else HTTPStatus.BAD_GATEWAY
+        status = HTTPStatus.OK if result.done else HTTPStatus.BAD_GATEWAY
         if HEADER in self.headers:
-            self._json(status, {"done": told.done, "text": told.text})
+            self._json(status, {"done": result.done, "text": result.text})
         else:
-            self._answer(status, f"{told.text}\n".encode(), "text/plain; charset=utf-8")
+            self._answer(status, f"{result.text}\n".encode(), "text/plain; charset=utf-8")
 
     # --- permission ----------------------------------------------------------------------------------------------
 
@@ -186,8 +186,8 @@ class PanelRequests(BaseHTTPRequestHandler):
         origins = self.headers.get_all("Origin", [])
         own = f"{self._panel.place.scheme}://{self.headers['Host'].strip()}".lower()
         site = self.headers.get("Sec-Fetch-Site", "same-origin")
-        said = origins == [] and HEADER in self.headers
-        if (said or [origin.lower() for origin in origins] == [own]) and site == "same-origin":
+        is_trusted = origins == [] and HEADER in self.headers
+        if (is_trusted or [origin.lower() for origin in origins] == [own]) and site == "same-origin":
             return True
         self._refuse(HTTPStatus.FORBIDDEN, "a page of another origin may not do this: open the panel itself")
         return False
@@ -197,10 +197,10 @@ class PanelRequests(BaseHTTPRequestHandler):
 
     def _secret(self) -> str:
         try:
-            found = SimpleCookie(self.headers.get("Cookie", "")).get(self._panel.cookie)
+            morsel = SimpleCookie(self.headers.get("Cookie", "")).get(self._panel.cookie)
         except CookieError:
             return ""
-        return found.value if found is not None else ""
+        return morsel.value if morsel is not None else ""
 
     def _posted_fields(self) -> dict[str, Any]:
         """Return the posted object, {} if it is unreadable: no press is lost because of its content."""
@@ -208,22 +208,22 @@ class PanelRequests(BaseHTTPRequestHandler):
         if "Transfer-Encoding" in self.headers or not length.isascii() or not length.isdigit():
             self.close_connection = True
             return {}
-        if (wanted := int(length[:9])) > _LARGEST:
+        if (size := int(length[:9])) > _LARGEST:
             self.close_connection = True
         if self._connection.presses:
             self.connection.settimeout(_PRESS_S)  # a press with an incomplete body counts all the same
         try:
-            said = self.rfile.read(
-                min(wanted, _DROPPED)
+            body = self.rfile.read(
+                min(size, _DROPPED)
             )  # a client whose body is not read may not receive the answer
             self.connection.settimeout(REQUEST_S)
-            found = json.loads(said) if wanted <= _LARGEST else {}
+            parsed = json.loads(body) if size <= _LARGEST else {}
         except (ValueError, RecursionError):
             return {}
         except OSError:
             self.close_connection = True
             return {}
-        return found if isinstance(found, dict) else {}
+        return parsed if isinstance(parsed, dict) else {}
 
     # --- answers -----------------------------------------------------------------------------------------------
 
@@ -232,9 +232,9 @@ class PanelRequests(BaseHTTPRequestHandler):
         value = f"{self._panel.cookie}={secret}; Path=/; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}"
         return {"Set-Cookie": value}
 
-    def _refuse(self, status: HTTPStatus, why: str) -> None:
+    def _refuse(self, status: HTTPStatus, reason: str) -> None:
         self.close_connection = True  # the body has not been read
-        self._json(status, {"done": False, "text": why})
+        self._json(status, {"done": False, "text": reason})
 
     def _json(self, status: HTTPStatus, content: Any, more: dict[str, str] | None = None) -> None:
         self._answer(status, json.dumps(content).encode(), "application/json", more)
@@ -263,9 +263,9 @@ class PanelRequests(BaseHTTPRequestHandler):
         log.debug("%s %s", self._connection.source, format % args)
 
 
-def _uuid(said: dict[str, Any]) -> str:
+def _uuid(fields: dict[str, Any]) -> str:
     """Return the uuid that the page sent, so that a repetition is not a second press; else a new uuid."""
     try:
-        return str(uuid.UUID(str(said.get("uuid"))))
+        return str(uuid.UUID(str(fields.get("uuid"))))
     except ValueError:
         return str(uuid.uuid4())

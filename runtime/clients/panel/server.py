@@ -80,9 +80,13 @@ class PanelServer(ThreadingHTTPServer):
         self.handle_request()
         now = time.monotonic()
         with self._lock:
-            over = [one for one in self._connections if now > one.until and not one.presses]
-        for one in over:
-            one.cut()
+            over = [
+                connection
+                for connection in self._connections
+                if now > connection.until and not connection.presses
+            ]
+        for connection in over:
+            connection.cut()
         if self._tls is not None and now - self._looked_at_files > _RENEWED_S:
             self._looked_at_files = now
             self._load_renewed(self._tls)
@@ -106,45 +110,45 @@ class PanelServer(ThreadingHTTPServer):
 
     def get_request(self) -> tuple[Any, Any]:
         """Accept the next connection; the TLS handshake is left to its thread."""
-        found, address = self.socket.accept()
-        found.settimeout(REQUEST_S)
+        accepted, address = self.socket.accept()
+        accepted.settimeout(REQUEST_S)
         # without it the parts of an answer are delayed by 40 ms (Nagle and delayed ACK)
-        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
+        accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
         if self._tls is not None:
-            return self._tls.wrap_socket(found, server_side=True, do_handshake_on_connect=False), address
-        return found, address
+            return self._tls.wrap_socket(accepted, server_side=True, do_handshake_on_connect=False), address
+        return accepted, address
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Start a thread for the connection; if there are too many, cut off another."""
         source = str(client_address[0]).removeprefix("::ffff:")
-        made = Connection(request, source, time.monotonic() + REQUEST_S)
+        connection = Connection(request, source, time.monotonic() + REQUEST_S)
         with self._lock:
             full = self._serving >= MOST_THREADS
             if not full:
                 self._serving += 1
                 surplus = self._surplus(source)
-                self._connections.append(made)
+                self._connections.append(connection)
         if full:  # all threads are in use and none has ended yet
             self.shutdown_request(request)
             return
         if surplus is not None:
             surplus.cut()
         try:
-            threading.Thread(target=self._serve, args=(made, client_address), daemon=True).start()
+            threading.Thread(target=self._serve, args=(connection, client_address), daemon=True).start()
         except RuntimeError:  # the machine cannot start another thread
-            self._ended(made)
+            self._ended(connection)
 
     def _surplus(self, source: str) -> Connection | None:
         """Return the oldest connection that must be cut off to admit a new one from `source`; None if there is room.
 
         Connections that press the e-stop are never cut off.
         """
-        going = [one for one in self._connections if not one.gone]
-        of_it = [one for one in going if one.source == source]
+        going = [connection for connection in self._connections if not connection.gone]
+        of_it = [connection for connection in going if connection.source == source]
         among = of_it if len(of_it) >= MOST_OF_ONE else going
         if len(among) < (MOST_OF_ONE if among is of_it else MOST):
             return None
-        return next((one for one in among if not one.presses), None)
+        return next((connection for connection in among if not connection.presses), None)
 
     def _serve(self, connection: Connection, client_address: Any) -> None:
         handshake: Callable[[], None] | None = getattr(connection.socket, "do_handshake", None)

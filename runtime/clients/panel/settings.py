@@ -32,10 +32,10 @@ class PanelPlace:
         """Return the TLS context, None without a certificate. Raises: ConfigurationError if its files are invalid."""
         if not self.certificate:
             return None
-        made = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        made.minimum_version = ssl.TLSVersion.TLSv1_2
-        self.load(made)
-        return made
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        self.load(context)
+        return context
 
     def load(self, context: ssl.SSLContext) -> None:
         """Load certificate and key into `context`; also used after a renewal. Raises: ConfigurationError."""
@@ -57,10 +57,10 @@ class PanelPlace:
 
         A page that reaches the panel through DNS rebinding sends its own name.
         """
-        said = _HOST.fullmatch(host.strip().lower())
-        if said is None:
+        match = _HOST.fullmatch(host.strip().lower())
+        if match is None:
             return False
-        name = said[1].rstrip(".")
+        name = match[1].rstrip(".")
         if name in ("localhost", *self.names):
             return True
         try:
@@ -78,14 +78,14 @@ def place_of(station_dir: Path) -> PanelPlace:
     """
     path = station_dir / "resolved.json"
     try:
-        said = json.loads(path.read_text("utf-8"))["panel"]
+        fields = json.loads(path.read_text("utf-8"))["panel"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigurationError(
             f"station {station_dir.name!r} is not known here ({path}: {error.__class__.__name__}); start it "
             "with python -m runtime DEPLOYMENT, or name another data folder"
         ) from None
-    if said is None:
+    if fields is None:
         raise ConfigurationError(f"the deployment of {station_dir.name!r} has no [panel]: add one")
-    names = frozenset(name.lower() for name in said["names"])
-    files = said["certificate"] or "", said["key"] or ""
-    return PanelPlace(said["host"], said["port"], names, *files)
+    names = frozenset(name.lower() for name in fields["names"])
+    files = fields["certificate"] or "", fields["key"] or ""
+    return PanelPlace(fields["host"], fields["port"], names, *files)

@@ -56,8 +56,8 @@ class Stops:
             ack = self._ask(command, ("coordinator", "commands"), _COORDINATOR_S)
         except (TransportError, CodecError) as fault:
             return StopResult(False, f"{fault}; the E-STOP goes another way")
-        done = ack.status in ("done", "accepted")
-        return StopResult(done, "stopped" if done else ack.reason)
+        accepted = ack.status in ("done", "accepted")
+        return StopResult(accepted, "stopped" if accepted else ack.reason)
 
     def _command(self, uuid: str, kind: str, source: str, args: dict[str, Any]) -> Command:
         holder = PANEL + source

@@ -82,10 +82,10 @@ class Watch:
         `silent_s` is the time without a new state [s], 0 if it is below SILENT_S.
         """
         silent = self._clock() - self._heard
-        told = displayed_state(self._state) if self._state else {}
-        told["silent_s"] = 0.0 if silent < SILENT_S else round(min(silent, 1e6), 1)
-        told["cameras"] = {name: picture.number for name, picture in sorted(self._pictures.items())}
-        return told | {"station": self._station_dir.name, "lab": read_uplink(self._endpoints)}
+        fields = displayed_state(self._state) if self._state else {}
+        fields["silent_s"] = 0.0 if silent < SILENT_S else round(min(silent, 1e6), 1)
+        fields["cameras"] = {name: picture.number for name, picture in sorted(self._pictures.items())}
+        return fields | {"station": self._station_dir.name, "lab": read_uplink(self._endpoints)}
 
     def picture(self, camera: str) -> Picture | None:
         """Return the newest image of a camera, None if there is none."""
@@ -110,20 +110,20 @@ class Watch:
     def _follow(self) -> None:
         """Receive the streams until the page has not been used for `_LOOKED_AT_S`."""
         state, cameras = _Ear(self._context, "state"), _Ear(self._context, "camera/")
-        found = -float("inf")
+        searched_at = -float("inf")
         try:
             while not self._ended.is_set() and self._clock() - self._looked < _LOOKED_AT_S:
-                if self._clock() - found >= _FIND_S:
-                    found = self._clock()
+                if self._clock() - searched_at >= _FIND_S:
+                    searched_at = self._clock()
                     state.turn_to(self._place("coordinator", "state"))
                     cameras.turn_to(self._place("media", "cameras"))
                 for name, jpeg in cameras.receive(0.0).items():
                     camera = name.removeprefix("camera/")
                     before = self._pictures.get(camera)
                     self._pictures[camera] = Picture(before.number + 1 if before else 1, bytes(jpeg))
-                said = state.receive(_TURN_S)
-                if "state" in said:
-                    self._state, self._heard = complete_state_meaning(said["state"]), self._clock()
+                message = state.receive(_TURN_S)
+                if "state" in message:
+                    self._state, self._heard = complete_state_meaning(message["state"]), self._clock()
         finally:
             state.turn_to("")
             cameras.turn_to("")
@@ -168,7 +168,7 @@ def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
     """
     meaning, run = snapshot["state_is"], snapshot.get("run") or {}
     lease = snapshot.get("lease") or {}
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "state": str(meaning["label"]),
         "tone": str(meaning["tone"]),
         "reason": _reason(snapshot),
@@ -177,19 +177,19 @@ def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
         "latched": bool(meaning["latched"]),
     }
     if meaning["run_open"] and run.get("number"):
-        told |= {"elapsed_s": float(run["elapsed"]), "limit_s": run.get("duration_s")}
-    return told
+        fields |= {"elapsed_s": float(run["elapsed"]), "limit_s": run.get("duration_s")}
+    return fields
 
 
 def _reason(snapshot: Mapping[str, Any]) -> str:
     reason = str(snapshot.get("reason") or "")
-    said = (snapshot.get("sentences") or {}).get("reason")
-    return reason if not reason or _open(said) else _ELSEWHERE
+    sentence = (snapshot.get("sentences") or {}).get("reason")
+    return reason if not reason or _open(sentence) else _ELSEWHERE
 
 
-def _open(said: Any) -> bool:
+def _open(sentence: Any) -> bool:
     """Return True if a sentence, and all sentences in its arguments, are of kinds that the panel may display."""
-    if not isinstance(said, Mapping) or str(said.get("id")).split(".")[0] not in _SHOWN:
+    if not isinstance(sentence, Mapping) or str(sentence.get("id")).split(".")[0] not in _SHOWN:
         return False
-    within = said.get("arguments") or {}
+    within = sentence.get("arguments") or {}
     return all(_open(value) for value in within.values() if isinstance(value, Mapping))

@@ -27,11 +27,11 @@ def aim_arguments(client: StationClient, given: argparse.Namespace) -> dict[str,
     return {"joints": _changed(status["facts"]["joint_names"], commanded, given.joint)}
 
 
-def _jog(given: argparse.Namespace, arm: str) -> dict[str, Any]:
-    millimetres, degrees = given.xyz or [0.0] * 3, given.rpy or [0.0] * 3
+def _jog(options: argparse.Namespace, arm: str) -> dict[str, Any]:
+    millimetres, degrees = options.xyz or [0.0] * 3, options.rpy or [0.0] * 3
     return {
         "arm": arm,
-        "frame": given.frame,
+        "frame": options.frame,
         "translation": [part / 1000 for part in millimetres],
         "rotation": [math.radians(part) for part in degrees],
     }
@@ -59,15 +59,15 @@ def aim_lines(
         names: Names of the joints [D].
         speed: Share of the speed of such motions, up to 1.
     """
-    told = [
+    lines = [
         f"  {name:<24} {now:+.4f} -> {then:+.4f}"
         for name, now, then in zip(names, commanded, aim["joints"], strict=True)
         if abs(then - now) >= _STILL
     ]
-    told = told or ["  no joint would move"]
-    told.append(f"  at most {aim['distance']:.3f} rad, in up to {aim['duration_s'] / speed:.1f} s")
+    lines = lines or ["  no joint would move"]
+    lines.append(f"  at most {aim['distance']:.3f} rad, in up to {aim['duration_s'] / speed:.1f} s")
     short = aim_problem(aim)
-    return [*told, f"  NOT AS ASKED: {short}"] if short else told
+    return [*lines, f"  NOT AS ASKED: {short}"] if short else lines
 
 
 def aim_problem(aim: Mapping[str, Any]) -> str:

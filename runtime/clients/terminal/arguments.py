@@ -13,45 +13,45 @@ def arguments(given: argparse.Namespace) -> dict[str, Any]:
     return {} if build is None else _without_none(build(given))
 
 
-def _setup(given: argparse.Namespace) -> dict[str, Any]:
-    policy = dict(given.policy or []) | _without_none({"url": given.policy_url})
+def _setup(options: argparse.Namespace) -> dict[str, Any]:
+    policy = dict(options.policy or []) | _without_none({"url": options.policy_url})
     return {
         "policy": policy or None,
-        "strategy": None if given.strategy is None else {"kind": given.strategy},
-        "task": given.task,
+        "strategy": None if options.strategy is None else {"kind": options.strategy},
+        "task": options.task,
         "checkpoint": None
-        if given.checkpoint is None
-        else {"id": given.checkpoint, "name": given.checkpoint},
-        "bench": None if given.bench_seed is None else {"seed": given.bench_seed},
-        "collect": given.collect,
+        if options.checkpoint is None
+        else {"id": options.checkpoint, "name": options.checkpoint},
+        "bench": None if options.bench_seed is None else {"seed": options.bench_seed},
+        "collect": options.collect,
     }
 
 
-def _run(given: argparse.Namespace) -> dict[str, Any]:
+def _run(options: argparse.Namespace) -> dict[str, Any]:
     return {
-        "mode": given.mode,
-        "sim_state": given.sim_state,
-        "duration_s": given.duration,
-        "operator": given.operator,
-        "task": given.task,
+        "mode": options.mode,
+        "sim_state": options.sim_state,
+        "duration_s": options.duration,
+        "operator": options.operator,
+        "task": options.task,
     }
 
 
-def _label(given: argparse.Namespace) -> dict[str, Any]:
-    return {"result": given.result, "note": given.note, "episode": given.episode}
+def _label(options: argparse.Namespace) -> dict[str, Any]:
+    return {"result": options.result, "note": options.note, "episode": options.episode}
 
 
-def _discard(given: argparse.Namespace) -> dict[str, Any]:
-    return {"episode": given.episode}
+def _discard(options: argparse.Namespace) -> dict[str, Any]:
+    return {"episode": options.episode}
 
 
-def _gripper(given: argparse.Namespace) -> dict[str, Any]:
-    return {"action": given.action, "arm": given.arm}
+def _gripper(options: argparse.Namespace) -> dict[str, Any]:
+    return {"action": options.action, "arm": options.arm}
 
 
-def _tune(given: argparse.Namespace) -> dict[str, Any]:
-    strategy = dict(given.set or []) | _without_none({"kind": given.strategy})
-    return {"strategy": strategy or None, "task": given.task}
+def _tune(options: argparse.Namespace) -> dict[str, Any]:
+    strategy = dict(options.set or []) | _without_none({"kind": options.strategy})
+    return {"strategy": strategy or None, "task": options.task}
 
 
 _BUILDERS = {

@@ -111,5 +111,5 @@ class _KeyLine(_PeriodicLine):
         self._last = now
         self._tell(status_line(status))
         if status["phase"] in ("waiting", "proposed"):
-            what = distance_text(status["proposal"], "the chunk that is shown")
-            self._tell(f"  {what + '  ' if what else ''}[{self._keys}]")
+            text = distance_text(status["proposal"], "the chunk that is shown")
+            self._tell(f"  {text + '  ' if text else ''}[{self._keys}]")

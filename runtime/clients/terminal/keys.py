@@ -84,7 +84,7 @@ def keys() -> Keys:
     """Return the keyboard if this process is in the foreground of a terminal, else NoKeys."""
     try:
         descriptor = sys.stdin.fileno()
-        ours = os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
+        is_foreground = os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
     except (OSError, ValueError, AttributeError):  # standard input is closed or not a file
-        ours = False
-    return Keyboard(descriptor) if ours else NoKeys()
+        is_foreground = False
+    return Keyboard(descriptor) if is_foreground else NoKeys()

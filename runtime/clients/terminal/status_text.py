@@ -69,7 +69,10 @@ def status_report(status: Mapping[str, Any], me: str) -> list[str]:
         ("first", distance_text(status["first_action"], "the policy's first action")),
         ("chunk", distance_text(status["proposal"], "the chunk that is shown")),
         ("recording", status["recording"]["uuid"] or "none"),
-        *(("unclosed", f"{uuid}: {why}") for uuid, why in status["recording"].get("unclosed", {}).items()),
+        *(
+            ("unclosed", f"{uuid}: {reason}")
+            for uuid, reason in status["recording"].get("unclosed", {}).items()
+        ),
         ("allowed", ", ".join(status["allowed"])),
     ]
     return [status_line(status), *(f"  {name:<9} {text}" for name, text in rows if text)]
@@ -132,10 +135,10 @@ def tuning_lines(status: Mapping[str, Any], everything: bool = False) -> list[st
     """
     in_force = status["tuning"]
     uses = status["facts"]["strategies"].get(in_force["kind"], [])
-    told = [in_force["kind"]]
+    parts = [in_force["kind"]]
     for name, value in in_force.items():
         if name == "kind" or not (everything or name in uses):
             continue
-        shown = "none" if value is None else value
-        told.append(f"{name} {shown}" + ("" if name in uses else f" (nothing to {in_force['kind']})"))
-    return told
+        text = "none" if value is None else value
+        parts.append(f"{name} {text}" + ("" if name in uses else f" (nothing to {in_force['kind']})"))
+    return parts

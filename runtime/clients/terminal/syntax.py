@@ -41,49 +41,49 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
         return press
 
 
-def _press(words: Sequence[str]) -> argparse.Namespace | None:
+def _press(arguments: Sequence[str]) -> argparse.Namespace | None:
     """Return the press of the e-stop in an invalid command line, None if there is none.
 
     STATION and estop may come in either order.
     """
-    said, data_dir = [], _data_dir()
-    left = iter(words)
+    positional, data_dir = [], _data_dir()
+    left = iter(arguments)
     for word in left:
         if word == "--data-dir":
             data_dir = next(left, data_dir)
         elif word.startswith("--data-dir="):
             data_dir = word.partition("=")[2]
         elif not word.startswith("-"):
-            said.append(word)
-    if "estop" not in said[:2] or len(said) < 2:
+            positional.append(word)
+    if "estop" not in positional[:2] or len(positional) < 2:
         return None
-    station = said[0] if said[1] == "estop" else said[1]
-    why = " ".join(said[2:]) or _PRESSED
+    station = positional[0] if positional[1] == "estop" else positional[1]
+    reason = " ".join(positional[2:]) or _PRESSED
     return argparse.Namespace(
-        data_dir=data_dir, station=station, command="estop", why=why, json="--json" in words
+        data_dir=data_dir, station=station, command="estop", why=reason, json="--json" in arguments
     )
 
 
-def _strictly(words: Sequence[str]) -> argparse.Namespace:
+def _strictly(arguments: Sequence[str]) -> argparse.Namespace:
     top, commands = _parser()
-    given, unknown = top.parse_known_args(_joined(words))
+    parsed, unknown = top.parse_known_args(_joined(arguments))
     if unknown:
-        command = commands[given.command]
+        command = commands[parsed.command]
         options = sorted(
             o for action in command._actions for o in action.option_strings if o.startswith("--")
         )
-        command.error(f"{given.command} does not take {' '.join(unknown)}; it takes {', '.join(options)}")
-    _check(given, commands[given.command])
-    return given
+        command.error(f"{parsed.command} does not take {' '.join(unknown)}; it takes {', '.join(options)}")
+    _check(parsed, commands[parsed.command])
+    return parsed
 
 
 def _data_dir() -> str:
     return os.environ.get("EVA_DATA_DIR") or "data"
 
 
-def _joined(words: Sequence[str]) -> list[str]:
+def _joined(arguments: Sequence[str]) -> list[str]:
     joined: list[str] = []
-    for word in words:
+    for word in arguments:
         if joined and joined[-1] in _TRIPLES:
             joined[-1] += f"={word}"
         else:
@@ -111,27 +111,29 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
     return top, commands
 
 
-def _check(given: argparse.Namespace, command: argparse.ArgumentParser) -> None:
+def _check(options: argparse.Namespace, command: argparse.ArgumentParser) -> None:
     """Check the combinations of options of `command` that argparse cannot check."""
-    if given.command == "tune" and not (given.show or given.strategy or given.set or given.task is not None):
+    if options.command == "tune" and not (
+        options.show or options.strategy or options.set or options.task is not None
+    ):
         command.error("tune needs --strategy, --set, --task or --show")
-    if given.command == "setup" and given.cancel and _setup_says_more(given):
+    if options.command == "setup" and options.cancel and _setup_says_more(options):
         command.error("setup --cancel takes nothing else")
-    if given.command == "jog" and given.xyz is None and given.rpy is None:
+    if options.command == "jog" and options.xyz is None and options.rpy is None:
         command.error("jog needs --xyz, --rpy or both")
 
 
-def _setup_says_more(given: argparse.Namespace) -> bool:
-    said = (
-        given.policy_url,
-        given.policy,
-        given.strategy,
-        given.task,
-        given.checkpoint,
-        given.bench_seed,
-        given.collect,
+def _setup_says_more(options: argparse.Namespace) -> bool:
+    values = (
+        options.policy_url,
+        options.policy,
+        options.strategy,
+        options.task,
+        options.checkpoint,
+        options.bench_seed,
+        options.collect,
     )
-    return any(value is not None for value in said)
+    return any(value is not None for value in values)
 
 
 # --- options of each command -------------------------------------------------------------------------------
@@ -314,18 +316,18 @@ def _triple(text: str) -> list[float]:
 
 def _joint(text: str) -> tuple[str, str, float]:
     """Parse a joint's target into (name, "=" or "+" or "-", value)."""
-    name, found, value = text.partition("=")
+    name, separator, value = text.partition("=")
     how = name[-1:] if name[-1:] in ("+", "-") else ""
     name = name[: len(name) - len(how)]
-    if not (found and name):
+    if not (separator and name):
         raise argparse.ArgumentTypeError(f"{text} was given; allowed: NAME=VALUE, NAME+=VALUE, NAME-=VALUE")
     return name, how or "=", _finite(value)
 
 
 def _setting(text: str) -> tuple[str, Any]:
     """Parse a setting into (key, value): JSON if valid, else text; "none" becomes None."""
-    key, found, value = text.partition("=")
-    if not (found and key):
+    key, separator, value = text.partition("=")
+    if not (separator and key):
         raise argparse.ArgumentTypeError(f"{text} was given; allowed: KEY=VALUE")
     if value == "none":
         return key, None

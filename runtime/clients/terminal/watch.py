@@ -21,24 +21,24 @@ def watch(client: StationClient, as_json: bool) -> int:
     The stream only wakes the loop; events are fetched by number, so that none is missed.
     """
     status = client.status()
-    boot, seen, shown = status["boot"], status["newest_event"], 0.0
+    boot, newest_event, displayed_at = status["boot"], status["newest_event"], 0.0
     subscriber = client.subscribe("state")
     while True:
-        heard = subscriber.receive(_PATIENCE_S)
-        if "state" in heard:
-            status = complete_state_meaning(heard["state"])
+        message = subscriber.receive(_PATIENCE_S)
+        if "state" in message:
+            status = complete_state_meaning(message["state"])
         else:
             status = client.status()  # raises TransportError if the station is gone
             subscriber.close()
             subscriber = client.subscribe("state")  # a restarted station has new sockets
         if status["boot"] != boot:
-            boot, seen = status["boot"], 0
-        if status["newest_event"] > seen:
-            for event in client.events_since(seen):
+            boot, newest_event = status["boot"], 0
+        if status["newest_event"] > newest_event:
+            for event in client.events_since(newest_event):
                 print_event(event, as_json)
-                seen = event["number"]
-        if time.monotonic() - shown > _SHOW_S:
-            shown = time.monotonic()
+                newest_event = event["number"]
+        if time.monotonic() - displayed_at > _SHOW_S:
+            displayed_at = time.monotonic()
             print(
                 json.dumps(status, default=str) if as_json else status_line(status, client.holder), flush=True
             )
