@@ -34,14 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 1 if a thread of the link failed, 2 if there are no usable keys.
     """
-    given = _parser().parse_args(arguments)
+    options = _parser().parse_args(arguments)
     logs.configure_logging("link")
-    data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
-    station_dir = data / "stations" / given.station
+    data = Path(options.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+    station_dir = data / "stations" / options.station
     ended: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: ended.append(number))
-    lifeline = Lifeline() if given.lifeline else None
+    lifeline = Lifeline() if options.lifeline else None
     try:
         return _linked(data, station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.is_cut))
     except RuntimeFault as fault:
@@ -67,11 +67,11 @@ def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
             lab.port,
             lab.second_port,
         )
-        told = Telling(Endpoints(station_dir), lab.lab)
+        teller = Telling(Endpoints(station_dir), lab.lab)
         while not ended() and not link.failed.wait(_LOOK_S) and _written(data, station_dir) == written:
-            told.update(link.problem)
+            teller.update(link.problem)
         link.end()
-        told.end()
+        teller.end()
         if link.failed.is_set():
             return 1
     return 0
@@ -88,8 +88,8 @@ def _uploads() -> UploadSettings | None:
 
 def _written(data: Path, station_dir: Path) -> list[tuple[int, int]]:
     """Return the identity of the key files, which changes when the files are replaced."""
-    found = [path.stat() for path in (known_lab_path(station_dir), key_path(data)) if path.exists()]
-    return [(one.st_ino, one.st_mtime_ns) for one in found]
+    statuses = [path.stat() for path in (known_lab_path(station_dir), key_path(data)) if path.exists()]
+    return [(status.st_ino, status.st_mtime_ns) for status in statuses]
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -93,7 +93,7 @@ class Seldom:
     def due(self, name: str) -> bool:
         """Return True if a line about that name may be logged now."""
         now = self._clock()
-        self._told = {one: at for one, at in self._told.items() if now - at < _EVERY_S}
+        self._told = {text: at for text, at in self._told.items() if now - at < _EVERY_S}
         if name in self._told or len(self._told) >= _MOST_NAMES:
             return False
         self._told[name] = now

@@ -93,8 +93,8 @@ def contents_of(folder: Path) -> Contents:
         try:
             next(reading)
         except StopIteration as end:
-            found: Contents = end.value
-            return found
+            contents: Contents = end.value
+            return contents
 
 
 def contents_in_steps(folder: Path) -> Generator[None, None, Contents]:

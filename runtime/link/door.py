@@ -122,27 +122,29 @@ class Door:
         self.port = self._bind(host, port)
 
     def _bind(self, host: str, port: int) -> int:
-        shown = f"[{host}]" if ":" in host else host
+        displayed_host = f"[{host}]" if ":" in host else host
         try:
-            self.socket.bind(f"tcp://{shown}:{port or '*'}")
+            self.socket.bind(f"tcp://{displayed_host}:{port or '*'}")
         except zmq.ZMQError as error:
             self.close()
-            raise TransportError(f"cannot listen for stations at {shown}:{port}: {error.strerror}") from None
+            raise TransportError(
+                f"cannot listen for stations at {displayed_host}:{port}: {error.strerror}"
+            ) from None
         bound = self.socket.last_endpoint.decode()
         return int(bound.rpartition(":")[2])
 
     def arrivals(self) -> list[Arrival]:
         """Return received messages, bounded per turn. A connection that sends an unreadable message is cut off."""
         self._hear_of_connections()
-        found: list[Arrival] = []
+        arrivals: list[Arrival] = []
         room, self._room = _TURN_BYTES, _TURN_PARTS
         for _ in range(_TURN):
             if room <= 0 or not (frames := self._message()):
                 break
             room -= sum(len(frame) for frame in frames)
             if (arrival := self._arrival(frames)) is not None:
-                found.append(arrival)
-        return found
+                arrivals.append(arrival)
+        return arrivals
 
     def _message(self) -> list[zmq.Frame]:
         """Return the frames of the next complete message, [] if there is none.
@@ -195,7 +197,9 @@ class Door:
     def poll(self) -> None:
         """Cut off connections that flood, are silent, or are too many. Call regularly."""
         now = self._clock()
-        for peer in [one for one in self._known.by_descriptor.values() if now >= one.cut_at]:
+        for peer in [
+            candidate for candidate in self._known.by_descriptor.values() if now >= candidate.cut_at
+        ]:
             self._shut(peer)
         if now - self._watched >= _WATCH_S:
             self._watch()
@@ -305,20 +309,20 @@ class Door:
         self.socket.get(zmq.EVENTS)  # makes ZMQ process ended connections
         return self.send(route, Beat())
 
-    def _flood(self, peer: Peer, why: str) -> None:
+    def _flood(self, peer: Peer, reason: str) -> None:
         """Cut the connection off, and refuse its key for a while; if the key is not a station's, refuse the address."""
         if peer.route in self._known.by_route:
-            known = peer.key in self._allowed.now.stations
-            self._allowed.refuse(peer.key if known else str(peer.address[0]), self._clock())
-        self._end(peer, why)
+            is_known = peer.key in self._allowed.now.stations
+            self._allowed.refuse(peer.key if is_known else str(peer.address[0]), self._clock())
+        self._end(peer, reason)
 
-    def _end(self, peer: Peer, why: str) -> None:
+    def _end(self, peer: Peer, reason: str) -> None:
         if peer.route in self._known.by_route:
-            self.cut(peer.route, why)
+            self.cut(peer.route, reason)
         elif peer.cut_at == float("inf"):
             self._shut(peer)
             if self._seldom.due(str(peer.address[0])):
-                log.warning("%s is cut off: %s", peer, why)
+                log.warning("%s is cut off: %s", peer, reason)
 
     def _shut(self, peer: Peer) -> None:
         """Break the peer's TCP connection, so that ZMQ notices.
@@ -347,12 +351,12 @@ def _received(peer: Peer) -> int:
         with _same(peer.descriptor) as connection:
             if connection.getpeername() != peer.address:
                 return peer.received
-            told = connection.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _TCP_INFO_BYTES)
+            tcp_info = connection.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _TCP_INFO_BYTES)
     except OSError:
         return peer.received
-    if len(told) < _BYTES_RECEIVED + 8:
+    if len(tcp_info) < _BYTES_RECEIVED + 8:
         return peer.received
-    count: int = struct.unpack_from("=Q", told, _BYTES_RECEIVED)[0]
+    count: int = struct.unpack_from("=Q", tcp_info, _BYTES_RECEIVED)[0]
     return count
 
 

@@ -36,8 +36,8 @@ class Enrolling:
     def request(self, route: bytes, address: str, key: str, enrol: Enrol) -> str:
         """Queue an attempt; return the reason if it is refused, "" if it is queued."""
         now = self._clock()
-        self._tries = [one for one in self._tries if now - one[0] < _WITHIN_S]
-        if len(self._tries) >= _ALL or sum(one[1] == address for one in self._tries) >= _EACH:
+        self._tries = [attempt for attempt in self._tries if now - attempt[0] < _WITHIN_S]
+        if len(self._tries) >= _ALL or sum(attempt[1] == address for attempt in self._tries) >= _EACH:
             return f"more than {_EACH} tries to enrol within a minute: wait for a minute"
         self._tries.append((now, address))
         try:
@@ -48,11 +48,11 @@ class Enrolling:
 
     def answers(self) -> list[tuple[bytes, Enrolled | str]]:
         """Return the results since the last call, each with its connection."""
-        found = []
+        answers = []
         with suppress(Empty):
             while True:
-                found.append(self._answered.get_nowait())
-        return found
+                answers.append(self._answered.get_nowait())
+        return answers
 
     def end(self) -> None:
         """Stop the thread after the current query, without waiting for it: the database may hang."""
@@ -61,8 +61,8 @@ class Enrolling:
             self._asked.put_nowait(None)
 
     def _work(self) -> None:
-        while (asked := self._asked.get()) is not None and not self._ended:
-            at, route, key, enrol = asked
+        while (request := self._asked.get()) is not None and not self._ended:
+            at, route, key, enrol = request
             answer: Enrolled | str = "the lab cannot look the code up now: try again"
             try:
                 if self._clock() - at < _STALE_S:

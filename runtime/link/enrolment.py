@@ -50,14 +50,14 @@ def enrol(data: Path, address: str, code: Code, key: KeyPair, timeout: float = 1
         TransportError: There is no readable answer.
     """
     host, port = address_of(address)
-    shown = f"[{host}]" if ":" in host else host
+    displayed_host = f"[{host}]" if ":" in host else host
     context: zmq.Context[Any] = zmq.Context()
     heard_by = time.monotonic() + _HEARD_S
     try:
-        answer = _exchange(context, f"tcp://{shown}:{port}", code, key, timeout)
+        answer = _exchange(context, f"tcp://{displayed_host}:{port}", code, key, timeout)
         while answer == _NOT_OPEN and time.monotonic() < heard_by:
             time.sleep(_AGAIN_S)
-            answer = _exchange(context, f"tcp://{shown}:{port}", code, key, timeout)
+            answer = _exchange(context, f"tcp://{displayed_host}:{port}", code, key, timeout)
     finally:
         context.destroy(linger=0)
     if isinstance(answer, Bye):

@@ -120,9 +120,9 @@ class Gate:
             raise TransportError("streams of stations elsewhere have ended: see the log above")
         for remote in self._remotes.values():
             self._press(remote)
-        heard = {self._handle_safely(arrival) for arrival in self._door.arrivals()}
+        names = {self._handle_safely(arrival) for arrival in self._door.arrivals()}
         for remote in [
-            self._remotes[name] for name in heard if name
+            self._remotes[name] for name in names if name
         ]:  # after all messages of this turn, so that each station is adjusted once
             self._adjust(remote)
         for remote in self._remotes.values():
@@ -168,13 +168,13 @@ class Gate:
         """Pass on all messages of the e-stop socket; hold presses while there is no connection to the station."""
         if (mirror := remote.mirror) is None:
             return
-        presses, others = mirror.estop_turns.take_turn()
+        presses, commands = mirror.estop_turns.take_turn()
         for call, command in presses:
             payload, verified = _payload(mirror, call, command)
-            held = PendingPress(call, command, payload, verified, self._clock())
-            if not self._pass_press(remote, held):
-                self._hold_press(remote, held)
-        for call, command in others:
+            pending = PendingPress(call, command, payload, verified, self._clock())
+            if not self._pass_press(remote, pending):
+                self._hold_press(remote, pending)
+        for call, command in commands:
             self._pass_command(remote, (call, command), (GUARD, "estop"), mirror.estops)
 
     def _command(self, remote: Remote) -> None:
@@ -182,28 +182,28 @@ class Gate:
         if remote.mirror is None or remote.mirror.command_turns is None or remote.mirror.commands is None:
             return
         server = remote.mirror.commands
-        urgent, others = remote.mirror.command_turns.take_turn()
-        for asked in (*urgent, *others):
-            self._pass_command(remote, asked, (COORDINATOR, "commands"), server)
+        urgent, commands = remote.mirror.command_turns.take_turn()
+        for queued in (*urgent, *commands):
+            self._pass_command(remote, queued, (COORDINATOR, "commands"), server)
 
-    def _pass_press(self, remote: Remote, held: PendingPress) -> bool:
+    def _pass_press(self, remote: Remote, press: PendingPress) -> bool:
         """Send a press over a live connection, preferably that for stops; return False if there is none."""
         now = self._clock()
         line = remote.line(STOPS, now) or remote.line(COMMANDS, now)
         if line is None or remote.mirror is None:
             return False
-        token = held.payload, held.verified
+        token = press.payload, press.verified
         number = self._send(remote, line, (GUARD, "estop"), token, stops=True)
-        if number and not held.told:
+        if number and not press.told:
             server, until = remote.mirror.estops, now + _PENDING_S
-            remote.pending[number] = Pending(server, held.call, held.command, until, held)
+            remote.pending[number] = Pending(server, press.call, press.command, until, press)
         return bool(number)
 
     def _pass_command(
-        self, remote: Remote, asked: QueuedCommand, place: tuple[str, str], server: CommandServer
+        self, remote: Remote, queued: QueuedCommand, place: tuple[str, str], server: CommandServer
     ) -> None:
         assert remote.mirror is not None
-        (call, command), now = asked, self._clock()
+        (call, command), now = queued, self._clock()
         stops = command.kind in STOPPING
         payload, verified = _payload(remote.mirror, call, command)
         line = (remote.line(STOPS, now) if stops or place[0] == GUARD else None) or remote.line(COMMANDS, now)
@@ -222,7 +222,7 @@ class Gate:
             server.answer(call, _not_sent(remote, command))
 
     def _send(
-        self, remote: Remote, line: Line, place: tuple[str, str], said: tuple[bytes, bool], stops: bool
+        self, remote: Remote, line: Line, place: tuple[str, str], signed: tuple[bytes, bool], stops: bool
     ) -> int:
         """Send a command, with a token if its user is verified.
 
@@ -233,7 +233,7 @@ class Gate:
             Number of the request; 0 if it could not be sent.
         """
         self._number += 1
-        payload, verified = said
+        payload, verified = signed
         ask = Ask(self._number, *place, stops=stops)
         if verified:
             serial, signature = self._signer.token(remote.name, line.challenge, "/".join(place), payload)
@@ -254,8 +254,8 @@ class Gate:
     def _handle(self, arrival: Arrival) -> str:
         """Handle a message; return the name of the station that sent it, "" if it is not identified yet."""
         message = arrival.message
-        known = self._by_route.get(arrival.route)
-        if known is None:
+        place = self._by_route.get(arrival.route)
+        if place is None:
             if isinstance(message, Hello):
                 self._greet(arrival, message)
             elif isinstance(message, Enrol):
@@ -263,11 +263,11 @@ class Gate:
             else:
                 self._door.cut(arrival.route, "it did not say who it is")
             return ""
-        remote, line = self._remotes[known[0]], self._remotes[known[0]].lines[known[1]]
+        remote, line = self._remotes[place[0]], self._remotes[place[0]].lines[place[1]]
         line.heard_at = self._clock()
         if isinstance(message, Beat):
             line.challenge = message.challenge
-            if known[1] == COMMANDS:
+            if place[1] == COMMANDS:
                 remote.listening = message.listening
             self._door.send(arrival.route, Beat())
         elif isinstance(message, Answer):
@@ -295,10 +295,10 @@ class Gate:
         if remote.mirror is None and not self._mirrored(remote):
             self._door.cut(arrival.route, remote.refusal, _TRY_S)
             return
-        if why := apart(hello.release, hello.version, hello.station, lab_side=True):
+        if reason := apart(hello.release, hello.version, hello.station, lab_side=True):
             if not remote.up:  # while the station is linked, this is a second program
-                self._lower(remote, why)
-            self._door.cut(arrival.route, why)
+                self._lower(remote, reason)
+            self._door.cut(arrival.route, reason)
             return
         if hello.session != remote.session:
             self._leave_lines(remote, "another program has linked this station with the same key", 5.0)
@@ -322,8 +322,8 @@ class Gate:
         if isinstance(answer, str):
             self._door.cut(route, answer)
             return
-        told = Enrolled(answer.station, answer.lab, answer.tokens, self.second_port)
-        self._door.send(route, told)
+        reply = Enrolled(answer.station, answer.lab, answer.tokens, self.second_port)
+        self._door.send(route, reply)
         log.info("%s is enrolled", answer.station)
 
     # --- changes -----------------------------------------------------------------------------------------------
@@ -411,7 +411,7 @@ class Gate:
         if remote.up:
             remote.mirror.pictures(MEDIA in remote.listening)
         if remote.held:
-            remote.held = [held for held in remote.held if not self._pass_press(remote, held)]
+            remote.held = [press for press in remote.held if not self._pass_press(remote, press)]
 
     def _hold(self, remote: Remote) -> None:
         """Drop pending commands, whose answers were lost with the link.
@@ -430,37 +430,37 @@ class Gate:
         if len(remote.held) > _MOST_HELD:
             self._give_up(remote, remote.held.pop(0))
 
-    def _lower(self, remote: Remote, why: str) -> None:
+    def _lower(self, remote: Remote, reason: str) -> None:
         """Publish the reason why the station cannot be commanded."""
-        if remote.told != why and remote.mirror is not None:
-            remote.mirror.lower(why)
-            self._log_once(remote, why)
+        if remote.told != reason and remote.mirror is not None:
+            remote.mirror.lower(reason)
+            self._log_once(remote, reason)
 
     def _hold_on(self, remote: Remote, now: float) -> None:
         """Answer the senders of held presses if the link stays lost, and drop presses older than `_HELD_S`."""
-        for held in list(remote.held):
-            known = now - remote.lost_at > _HOPE_S  # lost before the press
-            if known or now - held.at > _HOPE_S:
-                self._give_up(remote, held)
-            if now - held.at > _HELD_S:
-                remote.held.remove(held)
+        for press in list(remote.held):
+            link_lost = now - remote.lost_at > _HOPE_S  # lost before the press
+            if link_lost or now - press.at > _HOPE_S:
+                self._give_up(remote, press)
+            if now - press.at > _HELD_S:
+                remote.held.remove(press)
 
-    def _give_up(self, remote: Remote, held: PendingPress) -> None:
+    def _give_up(self, remote: Remote, press: PendingPress) -> None:
         """Answer the sender of a held press, unless the sender has an answer already."""
-        told, held.told = held.told, True
-        if not told and remote.mirror is not None:
-            remote.mirror.estops.answer(held.call, _not_sent(remote, held.command, held.sent))
+        was_told, press.told = press.told, True
+        if not was_told and remote.mirror is not None:
+            remote.mirror.estops.answer(press.call, _not_sent(remote, press.command, press.sent))
 
     def _lose(self, routes: list[bytes]) -> None:
         """Remove the connections `routes`, which have ended."""
         for route in routes:
-            known = self._by_route.pop(route, None)
-            remote = self._remotes.get(known[0]) if known is not None else None
-            if remote is None or known is None:
+            place = self._by_route.pop(route, None)
+            remote = self._remotes.get(place[0]) if place is not None else None
+            if remote is None or place is None:
                 continue
-            line = remote.lines.get(known[1])
+            line = remote.lines.get(place[1])
             if line is not None and line.route == route:
-                del remote.lines[known[1]]
+                del remote.lines[place[1]]
                 self._adjust(remote)
         routes.clear()
 
@@ -477,27 +477,27 @@ class Gate:
         self._streams.leave(remote.name)
         self._close(remote, "the key of its computer was withdrawn")
 
-    def _close(self, remote: Remote, why: str) -> None:
+    def _close(self, remote: Remote, reason: str) -> None:
         self._hold(remote)
-        for held in remote.held:
-            self._give_up(remote, held)
+        for press in remote.held:
+            self._give_up(remote, press)
         if remote.mirror is not None:
-            remote.mirror.close(why)
+            remote.mirror.close(reason)
 
-    def _leave_lines(self, remote: Remote, why: str, again_s: float) -> None:
+    def _leave_lines(self, remote: Remote, reason: str, again_s: float) -> None:
         for line in remote.lines.values():
-            self._drop_line(line, why, again_s)
+            self._drop_line(line, reason, again_s)
         remote.lines.clear()
 
-    def _drop_line(self, line: Line, why: str, again_s: float) -> None:
+    def _drop_line(self, line: Line, reason: str, again_s: float) -> None:
         self._by_route.pop(line.route, None)
-        self._door.cut(line.route, why, again_s)
+        self._door.cut(line.route, reason, again_s)
 
-    def _log_once(self, remote: Remote, what: str) -> None:
-        if remote.told != what:
-            remote.told = what
-            if self._seldom.due(f"{remote.name}: {what}"):  # a computer may alternate between two reasons
-                log.warning("%s: %s", remote.name, what)
+    def _log_once(self, remote: Remote, text: str) -> None:
+        if remote.told != text:
+            remote.told = text
+            if self._seldom.due(f"{remote.name}: {text}"):  # a computer may alternate between two reasons
+                log.warning("%s: %s", remote.name, text)
 
 
 def _payload(mirror: Mirror, call: IncomingMessage, command: Command) -> tuple[bytes, bool]:
@@ -518,8 +518,8 @@ def _unsigned(command: Command) -> str:
 
 
 def _not_sent(remote: Remote, command: Command, sent: bool = False) -> Ack:
-    what = "sent and not answered" if sent else "not sent"
-    return _failed(remote, command, f"{what}, the link to {remote.name} is lost", sent)
+    state = "sent and not answered" if sent else "not sent"
+    return _failed(remote, command, f"{state}, the link to {remote.name} is lost", sent)
 
 
 def _failed(remote: Remote, command: Command, reason: str, sent: bool = False) -> Ack:

@@ -83,8 +83,8 @@ class Home:
         """
         self._poll()
         now = self._clock()
-        found = [uuid for uuid in self._closed if now >= self._put_off.get(uuid, now)]
-        return max(found, key=self._closed.__getitem__) if found else self._removable(now)
+        due = [uuid for uuid in self._closed if now >= self._put_off.get(uuid, now)]
+        return max(due, key=self._closed.__getitem__) if due else self._removable(now)
 
     def next_labels(self) -> tuple[str, bytes] | None:
         """Return uuid and label lines of an episode that the lab has with older labels; None if there is none."""
@@ -97,13 +97,13 @@ class Home:
             uuid = entry.name.removesuffix(".jsonl")
             if uuid not in self._receipts or now < self._put_off.get(f"labels {uuid}", now):
                 continue
-            found = entry.stat()
-            if self._labels.get(uuid) == (found.st_mtime_ns, found.st_size):
+            status = entry.stat()
+            if self._labels.get(uuid) == (status.st_mtime_ns, status.st_size):
                 continue
             lines = Path(entry.path).read_bytes()
             if hashlib.sha256(lines).hexdigest() != self._receipts[uuid].labels:
                 return uuid, lines
-            self._labels[uuid] = found.st_mtime_ns, found.st_size
+            self._labels[uuid] = status.st_mtime_ns, status.st_size
         return None
 
     def arrived(self, episode: str, contents: Contents) -> None:
@@ -112,9 +112,9 @@ class Home:
         A receipt is written. If the episode was offered again because its retention time is over, it is removed
         instead.
         """
-        known = self._receipts.get(episode)
-        if known is not None and known.digest == contents.digest and self._over(known):
-            self._remove(known)
+        stored = self._receipts.get(episode)
+        if stored is not None and stored.digest == contents.digest and self._over(stored):
+            self._remove(stored)
             return
         receipt = Receipt(episode, self._lab, contents.digest, contents.size, self._wall())
         self._store_receipt(receipt)
@@ -168,7 +168,7 @@ class Home:
 
     def _read(self) -> list[Receipt]:
         """Return the receipts of this lab; a receipt of another lab does not mean that this one has the episode."""
-        found = []
+        receipts = []
         for path in (self._data / UPLOADS / self._station).glob("*.json"):
             try:
                 receipt = Receipt(**json.loads(path.read_bytes()))
@@ -176,8 +176,8 @@ class Home:
                 log.warning("%s is no receipt, its episode is offered again: %r", path, error)
                 continue
             if receipt.lab == self._lab and is_episode(receipt.episode):
-                found.append(receipt)
-        return found
+                receipts.append(receipt)
+        return receipts
 
     def _store_receipt(self, receipt: Receipt) -> None:
         folder = self._data / UPLOADS / self._station

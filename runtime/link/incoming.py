@@ -57,15 +57,15 @@ def progress_of(data: Path, station: str, uuid: str) -> Progress | None:
     """Return the progress of an episode of that station; None if it was never offered or has arrived."""
     begun = data / "episodes" / ARRIVING / station
     try:
-        why = _temporary_path(begun, uuid, "declined").read_text("utf-8")
+        reason = _temporary_path(begun, uuid, "declined").read_text("utf-8")
     except OSError:
-        why = ""
+        reason = ""
     try:
         contents = unpacked(_temporary_path(begun, uuid, "json").read_bytes())
     except (OSError, CodecError):
-        return Progress(0, 0, why) if why else None
-    here = sum(min(_size(begun / uuid / file.name), file.size) for file in contents.files)
-    return Progress(here, contents.size, why)
+        return Progress(0, 0, reason) if reason else None
+    received = sum(min(_size(begun / uuid / file.name), file.size) for file in contents.files)
+    return Progress(received, contents.size, reason)
 
 
 def arrivals(data: Path) -> list[tuple[str, Path]]:
@@ -107,11 +107,11 @@ class Incoming:
         """Return the messages to send since the last call, each with its connection."""
         with suppress(BlockingIOError):
             os.eventfd_read(self.wake)
-        found = []
+        answers = []
         with suppress(Empty):
             while True:
-                found.append(self._answers.get_nowait())
-        return found
+                answers.append(self._answers.get_nowait())
+        return answers
 
     def end(self) -> None:
         """Stop all threads after their current messages."""
@@ -143,8 +143,8 @@ class _Desk:
 
     def _work(self) -> None:
         lower_priority()
-        while (asked := self._asked.get()) is not None:
-            route, message, part = asked
+        while (request := self._asked.get()) is not None:
+            route, message, part = request
             if route != self._route or message is None:
                 self._shelf.drop()
                 self._route = route
@@ -194,8 +194,8 @@ class _Begun:
 class _Unwanted(Exception):
     """Error that the lab declines the episode; `again_s`: pause before the station may offer it again [s]."""
 
-    def __init__(self, why: str, again_s: float) -> None:
-        super().__init__(why)
+    def __init__(self, reason: str, again_s: float) -> None:
+        super().__init__(reason)
         self.again_s = again_s
 
 
@@ -330,12 +330,12 @@ class Shelf:
 
         An offer with other content is declined; nothing is overwritten.
         """
-        here = contents_of(self._episodes / episode)
-        if here != contents:
-            other = [file.name for file in contents.files if file not in here.files]
+        existing = contents_of(self._episodes / episode)
+        if existing != contents:
+            differing = [file.name for file in contents.files if file not in existing.files]
             raise _Unwanted(
-                f"the lab has an episode {episode} already, with other content ({', '.join(other) or 'more files'}): "
-                "nothing is overwritten",
+                f"the lab has an episode {episode} already, with other content "
+                f"({', '.join(differing) or 'more files'}): nothing is overwritten",
                 _NEVER_S,
             )
         return self._arrived(episode, contents)
@@ -361,18 +361,20 @@ class Shelf:
         try:
             manifest = read_json(begun.folder / MANIFEST)
         except RecordingError as error:
-            manifest, why = {}, str(error)
+            manifest, reason = {}, str(error)
         else:
-            why = f"it is of episode {manifest.get('uuid')!r:.80} and station {manifest.get('station')!r:.80}"
+            reason = (
+                f"it is of episode {manifest.get('uuid')!r:.80} and station {manifest.get('station')!r:.80}"
+            )
         if (manifest.get("uuid"), manifest.get("station")) != (begun.episode, self.station):
             self._forget(begun.episode)
-            raise _Unwanted(f"its {MANIFEST} does not say that it is this station's: {why}", _NEVER_S)
+            raise _Unwanted(f"its {MANIFEST} does not say that it is this station's: {reason}", _NEVER_S)
 
-    def _require_room(self, wanted: int) -> None:
+    def _require_room(self, size: int) -> None:
         free = shutil.disk_usage(self._episodes).free
-        if free - wanted < self._reserve:
+        if free - size < self._reserve:
             raise _Unwanted(
-                f"the lab's disk has too little room for it: {free / 1e9:.1f} GB free, {wanted / 1e9:.1f} wanted, "
+                f"the lab's disk has too little room for it: {free / 1e9:.1f} GB free, {size / 1e9:.1f} wanted, "
                 f"{self._reserve / 1e9:.1f} are kept free",
                 _SOON_S,
             )
@@ -384,17 +386,17 @@ class Shelf:
 
         The oldest partial episodes beyond `_MOST_BEGUN` are deleted.
         """
-        folder, known = self._root / episode, _temporary_path(self._root, episode, "json")
+        folder, contents_file = self._root / episode, _temporary_path(self._root, episode, "json")
         sent = contents.packed()
         if (
-            not known.exists() or known.read_bytes() != sent
+            not contents_file.exists() or contents_file.read_bytes() != sent
         ):  # different content was offered under this uuid before
             self._forget(episode)
         folder.mkdir(parents=True, exist_ok=True)
         for path in folder.iterdir():
             if path.name not in {file.name for file in contents.files}:
                 path.unlink()
-        write_atomic(known, sent)
+        write_atomic(contents_file, sent)
         begun = sorted((path for path in self._root.iterdir() if path.is_dir()), key=_changed)
         for path in [path for path in begun if path != folder][: max(0, len(begun) - _MOST_BEGUN)]:
             self._forget(path.name)
@@ -406,15 +408,15 @@ class Shelf:
         for kind in ("json", "declined"):
             _temporary_path(self._root, episode, kind).unlink(missing_ok=True)
 
-    def _declined(self, episode: str, why: str, again_s: float) -> Declined:
-        log.warning("%s: episode %.40r is not taken: %s", self.station, episode, why)
+    def _declined(self, episode: str, reason: str, again_s: float) -> Declined:
+        log.warning("%s: episode %.40r is not taken: %s", self.station, episode, reason)
         if is_episode(episode):
             with suppress(OSError, RecordingError):  # full disk: the station is answered all the same
                 self._root.mkdir(parents=True, exist_ok=True)
-                write_atomic(_temporary_path(self._root, episode, "declined"), why.encode())
+                write_atomic(_temporary_path(self._root, episode, "declined"), reason.encode())
                 for path in sorted(self._root.glob("*.declined"), key=_changed)[:-_MOST_DECLINED]:
                     path.unlink()
-        return Declined(episode, why[:500], again_s)
+        return Declined(episode, reason[:500], again_s)
 
     def _request_reconcile(self, episode: str) -> None:
         """Create the mark by which a worker writes the episode's rows to the database."""
@@ -434,10 +436,10 @@ class Shelf:
         if manifest.get("station") != self.station:
             raise _Unwanted(f"episode {episode} is of another station of this lab", _NEVER_S)
         path = self._data / LABELS / f"{episode}.jsonl"
-        here = path.read_bytes() if path.exists() else b""
-        if not lines.startswith(here):
+        existing = path.read_bytes() if path.exists() else b""
+        if not lines.startswith(existing):
             raise _Unwanted("the lab has other labels of it: nothing is overwritten", _NEVER_S)
-        if lines != here:
+        if lines != existing:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(path, lines)
             self._request_reconcile(episode)

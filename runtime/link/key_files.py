@@ -122,8 +122,8 @@ def known_lab(station_dir: Path) -> KnownLab:
     """Read the station's record of its lab. Raises: ConfigurationError if it is not enrolled or the file is invalid."""
     path = known_lab_path(station_dir)
     try:
-        found = json.loads(path.read_text("utf-8"))
-        lab = KnownLab(**{name: kind(found[name]) for name, kind in _LAB_FIELDS.items()})
+        fields = json.loads(path.read_text("utf-8"))
+        lab = KnownLab(**{name: kind(fields[name]) for name, kind in _LAB_FIELDS.items()})
         if len(bytes.fromhex(lab.key)) != _KEY_BYTES or len(bytes.fromhex(lab.tokens)) != _KEY_BYTES:
             raise ValueError("a key of another length")
     except FileNotFoundError:
@@ -150,15 +150,15 @@ _LAB_FIELDS: dict[str, Any] = {
 def _read(path: Path) -> bytes:
     """Read a key of 32 bytes. Raises: ConfigurationError if others can read the file or it is not a key."""
     try:
-        found = os.stat(path, follow_symlinks=False)
-        if not stat.S_ISREG(found.st_mode) or found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        status = os.stat(path, follow_symlinks=False)
+        if not stat.S_ISREG(status.st_mode) or status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise ConfigurationError(
-                f"the key {path} has the mode {stat.S_IMODE(found.st_mode):04o}: a reader can act as its owner; "
+                f"the key {path} has the mode {stat.S_IMODE(status.st_mode):04o}: a reader can act as its owner; "
                 "allowed: a file with 0600"
             )
-        if found.st_uid not in (os.geteuid(), _ROOT):
+        if status.st_uid not in (os.geteuid(), _ROOT):
             raise ConfigurationError(
-                f"the key {path} belongs to {account_name(found.st_uid)}; allowed: {account_name(os.geteuid())}"
+                f"the key {path} belongs to {account_name(status.st_uid)}; allowed: {account_name(os.geteuid())}"
             )
         secret = path.read_bytes()
     except OSError as error:

@@ -158,8 +158,8 @@ class LabStreams:
                 self._leave(flow, "the lab has withdrawn or replaced this station's key")
             self._send_credits(flow)
         for route, sender in list(self._senders.items()):
-            known = (sender.station, STATE) in self._flows
-            if not known or not self._allowed.now.may_be(self._door.key_of(route), sender.station):
+            has_state = (sender.station, STATE) in self._flows
+            if not has_state or not self._allowed.now.may_be(self._door.key_of(route), sender.station):
                 self._cut_sender(route, "the lab has withdrawn or replaced this station's key")
 
     def _wait(self, wait_ms: int) -> None:
@@ -169,9 +169,9 @@ class LabStreams:
             poller.register(self._incoming.wake, zmq.POLLIN)
         poller.poll(wait_ms)
 
-    def _leave(self, flow: _Flow, why: str, again_s: float = 30.0) -> None:
+    def _leave(self, flow: _Flow, reason: str, again_s: float = 30.0) -> None:
         self._by_route.pop(flow.route, None)
-        self._door.cut(flow.route, why, again_s)
+        self._door.cut(flow.route, reason, again_s)
         flow.route, flow.credit = b"", 0
 
     def _work(self) -> None:
@@ -237,12 +237,14 @@ class LabStreams:
         if not self._allowed.now.may_be(arrival.key, hello.station) or flow is None:
             self._door.cut(arrival.route, f"{hello.station!r:.80} is not known here with this key", _SOON_S)
             return
-        if why := apart(hello.release, hello.version, hello.station, lab_side=True):
-            self._door.cut(arrival.route, why)
+        if reason := apart(hello.release, hello.version, hello.station, lab_side=True):
+            self._door.cut(arrival.route, reason)
             return
         replaced = "another connection of this station has taken its place"
         if sends:
-            for route in [route for route, one in self._senders.items() if one.station == hello.station]:
+            for route in [
+                route for route, sender in self._senders.items() if sender.station == hello.station
+            ]:
                 self._cut_sender(route, replaced, _SOON_S)
             self._senders[arrival.route] = _Sender(hello.station)
             self._door.send(arrival.route, Welcome(RELEASE, version()))
@@ -267,14 +269,14 @@ class LabStreams:
     def _send_credits(self, flow: _Flow) -> None:
         """Renew the credit while there are subscribers; send the list of wanted streams if it has changed."""
         flow.published.poll_subscriptions()
-        wanted = sorted(flow.published.topics)[:_MOST_TOPICS]
+        topics = sorted(flow.published.topics)[:_MOST_TOPICS]
         if not flow.route:
             return
-        count = _WINDOW[flow.role] - max(0, flow.credit) if wanted else 0
-        if not count and wanted == flow.asked:
+        count = _WINDOW[flow.role] - max(0, flow.credit) if topics else 0
+        if not count and topics == flow.asked:
             return
-        if self._door.send(flow.route, Credit(count, wanted)):
-            flow.credit, flow.asked = max(0, flow.credit) + count, wanted
+        if self._door.send(flow.route, Credit(count, topics)):
+            flow.credit, flow.asked = max(0, flow.credit) + count, topics
 
     # --- episodes ------------------------------------------------------------------------------------------------
 
@@ -302,9 +304,9 @@ class LabStreams:
             if not self._door.send(route, message):
                 self._cut_sender(route, "it does not read what it requested", _SOON_S)
 
-    def _cut_sender(self, route: bytes, why: str, again_s: float = 30.0) -> None:
+    def _cut_sender(self, route: bytes, reason: str, again_s: float = 30.0) -> None:
         self._forget_sender(route)
-        self._door.cut(route, why, again_s)
+        self._door.cut(route, reason, again_s)
 
     def _forget_sender(self, route: bytes) -> None:
         sender = self._senders.pop(route, None)

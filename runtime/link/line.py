@@ -150,13 +150,13 @@ class Line:
         if now - self._heard_at > (lost if self.up else _GREETED_S):
             self.drop(f"no message from the lab for {now - self._heard_at:.1f} s")
             return []
-        heard = self._received(now)
+        received = self._received(now)
         if self.socket is not None and (trouble := self._connection_problem()):
             self.drop(*trouble)
         elif self.up and now >= self._due:
             self._due = now + BEAT_S
             self.send(self._beat())
-        return heard
+        return received
 
     def send(self, message: Message, *parts: bytes) -> bool:
         """Send a message without waiting; return False if there is no connection or its queue is full."""
@@ -195,15 +195,15 @@ class Line:
         self._heard_at = now
         try:
             lab_key = bytes.fromhex(lab.key)
-            made = dialled(self._context, self._dial.endpoint, lab_key, self._dial.key, self._low)
+            connection = dialled(self._context, self._dial.endpoint, lab_key, self._dial.key, self._low)
         except zmq.ZMQError as error:
             self.drop(f"{self._dial.endpoint} is no address: {error.strerror}", _REFUSED_S)
             return
-        self.socket, self._monitor = made
+        self.socket, self._monitor = connection
         self.send(Hello(RELEASE, version(), lab.station, self._dial.role, self._dial.session))
 
     def _received(self, now: float) -> list[Heard]:
-        heard: list[Heard] = []
+        received: list[Heard] = []
         for _ in range(_TURN):
             if self.socket is None:
                 return []
@@ -223,12 +223,12 @@ class Line:
                 self.drop(message.why, message.again_s)
                 return []
             elif self.up and not isinstance(message, Beat):
-                heard.append((message, parts))
-        return heard
+                received.append((message, parts))
+        return received
 
     def _welcomed(self, lab: Welcome) -> None:
-        if why := apart(lab.release, lab.version, self._dial.lab.station, lab_side=False):
-            self.drop(why, _REFUSED_S)
+        if reason := apart(lab.release, lab.version, self._dial.lab.station, lab_side=False):
+            self.drop(reason, _REFUSED_S)
             return
         if self.why:
             log.info("the %s connection to the lab at %s is there", self._dial.role, self._dial.endpoint)

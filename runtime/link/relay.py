@@ -88,8 +88,8 @@ class Relay:
         if len(self._asked) >= _MOST:
             self._end(next(iter(self._asked)))
         now = self._clock()
-        asked = self._asked[number] = _PendingQuestion(*place, payload, signature, stops, now, now)
-        self._send(asked)
+        question = self._asked[number] = _PendingQuestion(*place, payload, signature, stops, now, now)
+        self._send(question)
 
     @property
     def is_pending(self) -> bool:
@@ -98,30 +98,34 @@ class Relay:
 
     def sockets(self) -> list[zmq.Socket[Any]]:
         """Return the sockets of pending requests; each becomes readable when its answer arrives."""
-        return [asked.client.socket for asked in self._asked.values() if asked.client is not None]
+        return [question.client.socket for question in self._asked.values() if question.client is not None]
 
     def answers(self) -> list[Answered]:
         """Return the answers that have arrived and the requests that have failed."""
-        now, found = self._clock(), []
-        for number, asked in list(self._asked.items()):
-            packed = asked.client.packed_answer() if asked.client is not None else None
+        now, answers = self._clock(), []
+        for number, question in list(self._asked.items()):
+            packed = question.client.packed_answer() if question.client is not None else None
             if packed is not None:
-                found.append(Answered(number, packed))
-                self._store(asked)
+                answers.append(Answered(number, packed))
+                self._store(question)
                 del self._asked[number]
-            elif asked.client is None and not asked.told and (not asked.stops or now - asked.since > _TELL_S):
-                found.append(
+            elif (
+                question.client is None
+                and not question.told
+                and (not question.stops or now - question.since > _TELL_S)
+            ):
+                answers.append(
                     Answered(number, failure="the station does not run on its computer: start it there")
                 )
-                asked.told = True
-            elif asked.client is None and (not asked.stops or now - asked.since > _FIND_S):
+                question.told = True
+            elif question.client is None and (not question.stops or now - question.since > _FIND_S):
                 del self._asked[number]
-            elif now - asked.since > _PATIENCE_S:
+            elif now - question.since > _PATIENCE_S:
                 self._end(number)
-            elif asked.stops and now - asked.looked > LOOK_S / 4:
-                asked.looked = now
-                self._send(asked)
-        return found
+            elif question.stops and now - question.looked > LOOK_S / 4:
+                question.looked = now
+                self._send(question)
+        return answers
 
     def forget(self) -> None:
         """Drop all pending requests; commands that were sent are executed nevertheless."""
@@ -139,19 +143,22 @@ class Relay:
             free.close()
         self._free.clear()
 
-    def _send(self, asked: _PendingQuestion) -> None:
+    def _send(self, question: _PendingQuestion) -> None:
         """Send the request to the current endpoint of its socket, unless it was sent there already."""
         try:
-            endpoint = str(self._endpoints.read(asked.process)[asked.socket])
+            endpoint = str(self._endpoints.read(question.process)[question.socket])
         except (TransportError, KeyError):
             return
-        if endpoint == asked.endpoint:
+        if endpoint == question.endpoint:
             return
-        if asked.client is not None:
-            self._taken(asked).close()
-        asked.endpoint, asked.client = endpoint, self._client((asked.process, asked.socket), endpoint)
+        if question.client is not None:
+            self._taken(question).close()
+        question.endpoint, question.client = (
+            endpoint,
+            self._client((question.process, question.socket), endpoint),
+        )
         try:
-            asked.client.forward(asked.payload, asked.signature)
+            question.client.forward(question.payload, question.signature)
         except zmq.ZMQError as error:  # the queue is full: the station does not read
             log.warning("%s takes no more: %s", endpoint, error.strerror)
 
@@ -165,27 +172,27 @@ class Relay:
             return free.clients.pop()
         return CommandClient(self._context, endpoint, owner=self._endpoints.owner)
 
-    def _store(self, asked: _PendingQuestion) -> None:
-        free, client = self._free[asked.process, asked.socket], self._taken(asked)
-        if free.endpoint == asked.endpoint:
+    def _store(self, question: _PendingQuestion) -> None:
+        free, client = self._free[question.process, question.socket], self._taken(question)
+        if free.endpoint == question.endpoint:
             free.clients.append(client)
         else:
             client.close()
 
-    def _taken(self, asked: _PendingQuestion) -> CommandClient:
-        client, asked.client = asked.client, None
+    def _taken(self, question: _PendingQuestion) -> CommandClient:
+        client, question.client = question.client, None
         assert client is not None
         return client
 
     def _end(self, number: int) -> None:
-        asked = self._asked.pop(number)
-        if asked.client is not None:
-            asked.client.close()
+        question = self._asked.pop(number)
+        if question.client is not None:
+            question.client.close()
 
     def _is_there(self, process: str) -> bool:
         try:
-            found = self._endpoints.read(process)
+            sockets = self._endpoints.read(process)
         except TransportError:
             return False
-        places = [str(place) for place in found.values() if str(place).startswith("ipc://")]
+        places = [str(place) for place in sockets.values() if str(place).startswith("ipc://")]
         return bool(places) and all(Path(place.removeprefix("ipc://")).exists() for place in places)

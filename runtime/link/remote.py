@@ -69,5 +69,5 @@ class Remote:
 
         Without a challenge no command can be signed.
         """
-        found = self.lines.get(role)
-        return found if found is not None and found.challenge and now - found.heard_at <= LOST_S else None
+        line = self.lines.get(role)
+        return line if line is not None and line.challenge and now - line.heard_at <= LOST_S else None

@@ -86,8 +86,8 @@ class Commands:
         if self._line.connections != self._connection:
             self._connection = self._line.connections
             self._relay.forget()
-        for answered in self._relay.answers():
-            self._line.send(Answer(answered.number, answered.failure), answered.packed)
+        for answer in self._relay.answers():
+            self._line.send(Answer(answer.number, answer.failure), answer.packed)
 
     @property
     def problem(self) -> str:
@@ -164,13 +164,13 @@ class Streams:
             self._pass(at, line, flow)
 
     def _pass(self, at: int, line: Line, flow: Flow) -> None:
-        heard = line.turn()
+        received = line.turn()
         if (
             line.connections != self._connections[at] or not line.up
         ):  # credit belongs to the connection that granted it
             flow.stop()
             self._connections[at] = line.connections
-        for message, _ in heard:
+        for message, _ in received:
             if isinstance(message, Credit):
                 flow.allow(message)
         now = self._clock()

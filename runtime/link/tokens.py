@@ -28,8 +28,8 @@ _LARGEST_SERIAL = (1 << 63) - 1
 
 def _signed(station: str, challenge: bytes, serial: int, place: str, payload: bytes) -> bytes:
     """Return the bytes to sign: fixed layout except two texts, which contain no zero byte and so cannot overlap."""
-    words = f"{station}\0{place}\0".encode()
-    return _DOMAIN + words + challenge + serial.to_bytes(8, "big") + hashlib.sha256(payload).digest()
+    label = f"{station}\0{place}\0".encode()
+    return _DOMAIN + label + challenge + serial.to_bytes(8, "big") + hashlib.sha256(payload).digest()
 
 
 class Signer:
@@ -74,12 +74,12 @@ class Challenges:
         """
         if not ask.signature:
             return "the lab names no user for it"
-        made = self._made.get(ask.challenge)
-        if made is None or self._clock() - made[0] > VALID_S:
+        challenge = self._made.get(ask.challenge)
+        if challenge is None or self._clock() - challenge[0] > VALID_S:
             return f"it was more than {VALID_S:g} s on its way from the lab: give it again"
         if not 0 <= ask.serial <= _LARGEST_SERIAL or not self._verifies(ask, payload):
             return "its signature is not this lab's"
-        serials = made[1]
+        serials = challenge[1]
         if ask.serial in serials or len(serials) >= _MOST_SERIALS:
             return "its token was used before"
         serials.add(ask.serial)

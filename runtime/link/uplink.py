@@ -55,8 +55,8 @@ class Telling:
 def read_uplink(endpoints: Endpoints) -> dict[str, Any] | None:
     """Return lab, since and why as a dict for JSON; None if the station has no link to a lab."""
     try:
-        found = endpoints.read(UPLINK)
-        told = {"lab": str(found["lab"]), "since": float(found["since"]), "why": str(found["why"])}
+        endpoint = endpoints.read(UPLINK)
+        fields = {"lab": str(endpoint["lab"]), "since": float(endpoint["since"]), "why": str(endpoint["why"])}
     except (TransportError, KeyError, ValueError, TypeError):
         return None
-    return told if endpoints.served(UPLINK) else told | {"why": _NOT_RUNNING}
+    return fields if endpoints.served(UPLINK) else fields | {"why": _NOT_RUNNING}

@@ -74,9 +74,9 @@ class UploadSettings:
 
 
 def _number(
-    given: Mapping[str, str], name: str, default: float | None, least: float, most: float
+    variables: Mapping[str, str], name: str, default: float | None, least: float, most: float
 ) -> float | None:
-    text = given.get(name, "").strip()
+    text = variables.get(name, "").strip()
     if not text:
         return default
     try:
@@ -106,11 +106,11 @@ class Runs:
             self._looked = now
             self._follow(self._source.endpoint())
         with suppress(CodecError, KeyError, TypeError, AttributeError):
-            said = self._subscriber.receive(0.0).get("state") if self._subscriber else None
-            if said:
+            state = self._subscriber.receive(0.0).get("state") if self._subscriber else None
+            if state:
                 self._going = (
-                    complete_state_meaning(said)["state_is"]["at_work"]
-                    or (said.get("recording") or {}).get("uuid") is not None
+                    complete_state_meaning(state)["state_is"]["at_work"]
+                    or (state.get("recording") or {}).get("uuid") is not None
                 )
                 self._heard = now
         return self._going and now - self._heard < _HEARD_S
@@ -173,11 +173,11 @@ class Uploads:
     def turn(self, wait_ms: int = _POLL_MS) -> None:
         """Wait for the lab, and send the bytes that it has requested, within the time and rate of a turn."""
         self._wait(wait_ms)
-        heard = self._line.turn()
+        received = self._line.turn()
         if self._line.connections != self._connection or not self._line.up:
             self._connection = self._line.connections
             self._forget()
-        for message, _ in heard:
+        for message, _ in received:
             self._handle(message)
         if not self._line.up or (self._runs is not None and self._runs.going()):
             return
@@ -219,9 +219,9 @@ class Uploads:
             self._arrived(offered, message)
         elif isinstance(message, Declined):
             self._forget()
-            what = offered.episode if offered.contents is not None else f"labels {offered.episode}"
-            self._home.put_off(what, min(max(message.again_s, _SOONEST_S), _LATEST_S))
-            self._log_once(what, f"the lab does not take it: {message.why}")
+            item = offered.episode if offered.contents is not None else f"labels {offered.episode}"
+            self._home.put_off(item, min(max(message.again_s, _SOONEST_S), _LATEST_S))
+            self._log_once(item, f"the lab does not take it: {message.why}")
 
     def _arrived(self, offered: _Offered, message: Arrived) -> None:
         try:
@@ -283,7 +283,7 @@ class Uploads:
             self._log_once(self._reading.episode, str(error))
             self._reading = None
 
-    def _log_once(self, what: str, why: str) -> None:
-        if self._told.get(what) != why:
-            self._told[what] = why
-            log.warning("episode %s is not sent to the lab: %s", what, why)
+    def _log_once(self, item: str, reason: str) -> None:
+        if self._told.get(item) != reason:
+            self._told[item] = reason
+            log.warning("episode %s is not sent to the lab: %s", item, reason)

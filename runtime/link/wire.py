@@ -218,7 +218,7 @@ _TYPES = {kind: get_type_hints(kind) for kind in _KINDS.values()}
 
 def write(message: Message, *parts: bytes) -> list[bytes]:
     """Return the frames of a message."""
-    content = {one.name: getattr(message, one.name) for one in fields(message)}
+    content = {message_field.name: getattr(message, message_field.name) for message_field in fields(message)}
     packed: bytes = msgpack.packb({"kind": type(message).__name__, **content})
     return [packed, *parts]
 
@@ -254,25 +254,27 @@ def _unpacked(header: bytes) -> dict[Any, Any]:
 
 
 def _fields(kind: type[Any], content: dict[Any, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for one in fields(kind):
-        if one.name in content:
-            value = content[one.name]
-            if not _fits(value, _TYPES[kind][one.name]):
-                raise CodecError(f"{kind.__name__}: {one.name} is no such {type(value).__name__}")
-            found[one.name] = value
-        elif one.default is MISSING and one.default_factory is MISSING:
-            raise CodecError(f"{kind.__name__} without {one.name}")
-    return found
+    values: dict[str, Any] = {}
+    for message_field in fields(kind):
+        if message_field.name in content:
+            value = content[message_field.name]
+            if not _fits(value, _TYPES[kind][message_field.name]):
+                raise CodecError(f"{kind.__name__}: {message_field.name} is no such {type(value).__name__}")
+            values[message_field.name] = value
+        elif message_field.default is MISSING and message_field.default_factory is MISSING:
+            raise CodecError(f"{kind.__name__} without {message_field.name}")
+    return values
 
 
-def _fits(value: object, wanted: Any) -> bool:
-    if get_origin(wanted) is list:
-        (inner,) = get_args(wanted)
+def _fits(value: object, kind: Any) -> bool:
+    if get_origin(kind) is list:
+        (inner,) = get_args(kind)
         return (
-            isinstance(value, list) and len(value) <= _MOST_WORDS and all(type(one) is inner for one in value)
+            isinstance(value, list)
+            and len(value) <= _MOST_WORDS
+            and all(type(element) is inner for element in value)
         )
-    return type(value) is wanted or (wanted is float and type(value) is int)
+    return type(value) is kind or (kind is float and type(value) is int)
 
 
 def apart(theirs: int, version: str, station: str, lab_side: bool) -> str:
