@@ -46,9 +46,9 @@ class FrozenCameraDetector:
         return new
 
 
-def _equal(one: UInt8, other: UInt8) -> bool:
+def _equal(first: UInt8, second: UInt8) -> bool:
     """Return True if two pictures are equal bit by bit; comparing a few rows first decides most cases."""
-    if one.shape != other.shape:
+    if first.shape != second.shape:
         return False
     sampled = slice(None, None, _SAMPLED_ROWS)
-    return np.array_equal(one[sampled], other[sampled]) and np.array_equal(one, other)
+    return np.array_equal(first[sampled], second[sampled]) and np.array_equal(first, second)

@@ -116,8 +116,8 @@ class NodeMessages:
         state = _map(message, "state")
         missing = [group.name for group in self._robot.groups if group.name not in state]
         if missing:
-            given = ", ".join(map(str, state)) or "none"
-            raise MessageRefused("missing_group", f"state lacks {', '.join(missing)}; it has {given}")
+            groups = ", ".join(map(str, state)) or "none"
+            raise MessageRefused("missing_group", f"state lacks {', '.join(missing)}; it has {groups}")
         parts = [_vector(f"state.{g.name}", state[g.name], g.dof) for g in self._robot.groups]
         return np.concatenate(parts)
 
@@ -125,44 +125,44 @@ class NodeMessages:
         images = _map(message, "images")
         missing = [key for key in self._cameras if key not in images]
         if missing:
-            given = ", ".join(map(str, images)) or "none"
-            raise MessageRefused("missing_camera", f"images lack {', '.join(missing)}; they have {given}")
+            cameras = ", ".join(map(str, images)) or "none"
+            raise MessageRefused("missing_camera", f"images lack {', '.join(missing)}; they have {cameras}")
         return {key: _picture(key, images[key]) for key in self._cameras}
 
     def _encoding_of(self, message: Mapping[Any, Any]) -> Encoding:
-        given = message.get("encoding", self._encoding)
-        if given == "bgr":
+        encoding = message.get("encoding", self._encoding)
+        if encoding == "bgr":
             return "bgr"
-        if given == "rgb":
+        if encoding == "rgb":
             return "rgb"
-        raise MessageRefused("unknown_encoding", f"encoding is {given!r}; allowed: 'bgr', 'rgb'")
+        raise MessageRefused("unknown_encoding", f"encoding is {encoding!r}; allowed: 'bgr', 'rgb'")
 
     def _optional(
-        self, remarks: list[tuple[str, str]], name: str, read: Callable[[str, object], Part], given: object
+        self, remarks: list[tuple[str, str]], name: str, read: Callable[[str, object], Part], value: object
     ) -> Part | None:
-        """Return the part that `read` reads from `given`; None if it is absent or unusable.
+        """Return the part that `read` reads from `value`; None if it is absent or unusable.
 
         An unusable part is added to `remarks`.
         """
-        if given is None:
+        if value is None:
             return None
         try:
-            return read(name, given)
+            return read(name, value)
         except MessageRefused as error:
             remarks.append((f"{name}_unusable", str(error)))
             return None
 
-    def _eef(self, name: str, given: object) -> Float32:
-        if not isinstance(given, dict):
-            raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map by arm")
-        missing = [arm.name for arm in self._robot.arms if arm.name not in given]
+    def _eef(self, name: str, poses: object) -> Float32:
+        if not isinstance(poses, dict):
+            raise MessageRefused("malformed", f"{name} is a {type(poses).__name__}; expected a map by arm")
+        missing = [arm.name for arm in self._robot.arms if arm.name not in poses]
         if missing:
             raise MessageRefused("missing_group", f"{name} lacks {', '.join(missing)}")
-        parts = [_vector(f"{name}.{arm.name}", given[arm.name], EEF_WIDTH) for arm in self._robot.arms]
+        parts = [_vector(f"{name}.{arm.name}", poses[arm.name], EEF_WIDTH) for arm in self._robot.arms]
         return self._poses(name, np.concatenate(parts) if parts else np.empty(0, np.float32))
 
-    def _poses(self, name: str, given: object) -> Float32:
-        vector = _vector(name, given, self._eef_width)
+    def _poses(self, name: str, poses: object) -> Float32:
+        vector = _vector(name, poses, self._eef_width)
         norms = np.linalg.norm(vector.reshape(-1, EEF_WIDTH)[:, 3:7], axis=1)
         if (np.abs(norms - 1.0) > 0.05).any():  # some nodes send zeros for an unknown pose
             raise MessageRefused(
@@ -170,8 +170,8 @@ class NodeMessages:
             )
         return vector
 
-    def _action(self, name: str, given: object) -> Float32:
-        return _vector(name, given, self._robot.dim)
+    def _action(self, name: str, value: object) -> Float32:
+        return _vector(name, value, self._robot.dim)
 
 
 def _stamp(message: Mapping[Any, Any]) -> float:
@@ -182,39 +182,39 @@ def _stamp(message: Mapping[Any, Any]) -> float:
 
 
 def _map(message: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
-    given = message.get(key)
-    if not isinstance(given, dict):
-        raise MessageRefused("malformed", f"{key} is a {type(given).__name__}; expected a map")
-    return given
+    value = message.get(key)
+    if not isinstance(value, dict):
+        raise MessageRefused("malformed", f"{key} is a {type(value).__name__}; expected a map")
+    return value
 
 
-def _vector(name: str, given: object, width: int) -> Float32:
-    if not isinstance(given, np.ndarray) or given.dtype.kind != "f":
-        kind = given.dtype.str if isinstance(given, np.ndarray) else type(given).__name__
+def _vector(name: str, value: object, width: int) -> Float32:
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+        kind = value.dtype.str if isinstance(value, np.ndarray) else type(value).__name__
         raise MessageRefused("wrong_dtype", f"{name} is {kind}; expected a float32 array")
-    if given.shape != (width,):
-        raise MessageRefused("wrong_dimension", f"{name} has shape {list(given.shape)}; expected [{width}]")
-    vector = given.astype(np.float32)
+    if value.shape != (width,):
+        raise MessageRefused("wrong_dimension", f"{name} has shape {list(value.shape)}; expected [{width}]")
+    vector = value.astype(np.float32)
     if not np.isfinite(vector).all():
         raise MessageRefused("not_finite", f"{name} has {vector.tolist()}; expected finite numbers")
     return vector
 
 
-def _picture(key: str, given: object) -> UInt8:
-    if not isinstance(given, np.ndarray) or given.dtype != np.uint8:
-        kind = given.dtype.str if isinstance(given, np.ndarray) else type(given).__name__
+def _picture(key: str, value: object) -> UInt8:
+    if not isinstance(value, np.ndarray) or value.dtype != np.uint8:
+        kind = value.dtype.str if isinstance(value, np.ndarray) else type(value).__name__
         raise MessageRefused("wrong_dtype", f"images.{key} is {kind}; expected a uint8 array")
-    if given.ndim != 3 or given.shape[2] != 3 or given.size == 0:
+    if value.ndim != 3 or value.shape[2] != 3 or value.size == 0:
         raise MessageRefused(
-            "wrong_dimension", f"images.{key} has shape {list(given.shape)}; expected [H, W, 3]"
+            "wrong_dimension", f"images.{key} has shape {list(value.shape)}; expected [H, W, 3]"
         )
-    return given
+    return value
 
 
-def _truth(name: str, given: object) -> Mapping[str, Any]:
+def _truth(name: str, value: object) -> Mapping[str, Any]:
     """Check the ground truth: JSON with the id of its reset, the milestones since then and the success."""
     try:
-        truth: dict[str, Any] = _JSON.validate_python(given)
+        truth: dict[str, Any] = _JSON.validate_python(value)
     except ValidationError as invalid:
         error = invalid.errors()[0]
         where = ".".join(map(str, (name, *error["loc"][:1])))
@@ -225,18 +225,20 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
     reset, milestones, success = truth.get("reset"), truth.get("milestones"), truth.get("success")
     if not isinstance(reset, str):
         raise MessageRefused("malformed", f"{name}.reset is {reset!r:.80}; expected the id of a reset or ''")
-    if not isinstance(milestones, dict) or not all(isinstance(done, bool) for done in milestones.values()):
+    if not isinstance(milestones, dict) or not all(
+        isinstance(reached, bool) for reached in milestones.values()
+    ):
         raise MessageRefused("malformed", f"{name}.milestones is {milestones!r:.80}; expected a map of bools")
     if not isinstance(success, bool):
         raise MessageRefused("malformed", f"{name}.success is {success!r:.80}; expected true or false")
     return truth
 
 
-def _drives(name: str, given: object) -> Mapping[str, Any]:
+def _drives(name: str, value: object) -> Mapping[str, Any]:
     """Return the state of the drives: whether they are enabled, and their faults; other keys are dropped."""
-    if not isinstance(given, dict):
-        raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map")
-    enabled, faults = given.get("enabled"), given.get("faults", [])
+    if not isinstance(value, dict):
+        raise MessageRefused("malformed", f"{name} is a {type(value).__name__}; expected a map")
+    enabled, faults = value.get("enabled"), value.get("faults", [])
     if not isinstance(enabled, bool):
         raise MessageRefused("malformed", f"{name}.enabled is {enabled!r:.80}; expected true or false")
     if not isinstance(faults, list) or not all(isinstance(fault, str) for fault in faults):
@@ -250,8 +252,8 @@ def _drives(name: str, given: object) -> Mapping[str, Any]:
     return {"enabled": enabled, "faults": list(faults)}
 
 
-def _number(given: object) -> int | None:
-    return given if type(given) is int else None
+def _number(value: object) -> int | None:
+    return value if type(value) is int else None
 
 
 def _status(message: Mapping[Any, Any]) -> NodeStatus:

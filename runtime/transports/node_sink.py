@@ -72,9 +72,9 @@ class NodeSink(Sink):
         Words that older nodes know also carry an action vector, which those nodes require: the newest command, or zeros
         before the first.
         """
-        taken = sorted({"t", "target", "action", "master", "seq"} & set(data))
-        if taken or word in ("real", "sim"):
-            raise TransportError(f"the control word {word!r} with {taken} would be taken for a command")
+        reserved = sorted({"t", "target", "action", "master", "seq"} & set(data))
+        if reserved or word in ("real", "sim"):
+            raise TransportError(f"the control word {word!r} with {reserved} would be taken for a command")
         form = {"action": self._newest} if word in _FORMED else {}
         self._send({"t": self._clock.now(), **form, "target": word, **data})
 

@@ -235,10 +235,10 @@ class NodeSource(Source):
         self._told = ""
 
     def _no_frame_reason(self, silent: float, refusal: str | None) -> str:
-        told = {"endpoint": self._endpoint, "seconds": silent}
+        fields = {"endpoint": self._endpoint, "seconds": silent}
         if refusal:
-            return _NOTHING_USABLE(**told, why=refusal)
-        return _STOPPED(**told) if self._count else _NEVER_CAME(**told)
+            return _NOTHING_USABLE(**fields, why=refusal)
+        return _STOPPED(**fields) if self._count else _NEVER_CAME(**fields)
 
     def _open_subscriber(self) -> zmq.Socket[bytes]:
         """Return a socket that receives from the node. Raises ZMQError."""

@@ -52,20 +52,20 @@ class Link(Settings):
     def _stay_on_this_machine(self) -> Link:
         host = _host(self.table, self.master)
         try:
-            here = ipaddress.ip_address(self.address).is_loopback
+            address_here = ipaddress.ip_address(self.address).is_loopback
         except ValueError as error:
             raise ConfigurationError(
                 f"{self.table}.address = {self.address!r} is no IP address; allowed: one of this machine's, which the "
                 "robot's nodes can reach"
             ) from error
         master_here = host == "localhost" or host.startswith("127.") or host == "::1"
-        if not (here and master_here) and not self.insecure_link:
-            what = f"address = {self.address!r}" if master_here else f"master = {self.master!r}"
+        if not (address_here and master_here) and not self.insecure_link:
+            setting = f"address = {self.address!r}" if master_here else f"master = {self.master!r}"
             raise ConfigurationError(
-                f"{self.table}.{what} leaves this machine without protection; allowed: 127.0.0.1, or insecure_link = "
-                "true on a network you trust"
+                f"{self.table}.{setting} leaves this machine without protection; allowed: 127.0.0.1, or "
+                "insecure_link = true on a network you trust"
             )
-        if here and not master_here:
+        if address_here and not master_here:
             raise ConfigurationError(
                 f"{self.table}.master = {self.master!r} with address = {self.address!r}: the robot's nodes do not "
                 "reach this machine there; allowed: this machine's address in the robot's network"

@@ -51,9 +51,9 @@ class Link(Settings):
     def _stay_on_this_machine(self) -> Link:
         elsewhere = self.network != dds_middleware.LOOPBACK or self.middleware == "rclpy"
         if elsewhere and not self.insecure_link:
-            what = f"network = {self.network!r}" if self.middleware == "dds" else 'middleware = "rclpy"'
+            setting = f"network = {self.network!r}" if self.middleware == "dds" else 'middleware = "rclpy"'
             raise ConfigurationError(
-                f"{self.table}.{what} may leave this machine without protection; allowed: "
+                f"{self.table}.{setting} may leave this machine without protection; allowed: "
                 'middleware = "dds" with network = "loopback", or insecure_link = true on a network you trust'
             )
         if self.peers and self.network in (dds_middleware.LOOPBACK, dds_middleware.ENVIRONMENT):
@@ -89,9 +89,9 @@ def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
 def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
     """Create the source of observations from the robot's topics. Raises ConfigurationError if a topic is unknown."""
     parts, _ = _checked(config, robot)
-    heard = subscriptions(parts, _quality(config, SENSOR_QUALITY))
+    subscribed = subscriptions(parts, _quality(config, SENSOR_QUALITY))
     return RosSource(
-        robot, heard, config.acceptance_limits, clock, cdr, lambda: middleware(config, f"{NODE}_source")
+        robot, subscribed, config.acceptance_limits, clock, cdr, lambda: middleware(config, f"{NODE}_source")
     )
 
 
@@ -112,14 +112,16 @@ def middleware(config: Link, name: str) -> Middleware:
 def _checked(config: Config, robot: Robot) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:
     """Return the subscribed streams and the command topics, after checking the keys and durability of `qos`."""
     parts, outlets = config.streams(robot, 2)
-    heard, told = {part.topic for part in parts}, {outlet.topic for outlet in outlets}
-    unknown = sorted(set(config.qos) - heard - told)
+    subscribed, published = {part.topic for part in parts}, {outlet.topic for outlet in outlets}
+    unknown = sorted(set(config.qos) - subscribed - published)
     if unknown:
         raise ConfigurationError(
             f"transport.qos: {', '.join(unknown)} are no topics of this deployment; "
-            f"allowed: {', '.join(sorted(heard | told))}"
+            f"allowed: {', '.join(sorted(subscribed | published))}"
         )
-    late = sorted(topic for topic in told & set(config.qos) if config.qos[topic].durability != "volatile")
+    late = sorted(
+        topic for topic in published & set(config.qos) if config.qos[topic].durability != "volatile"
+    )
     if late:
         raise ConfigurationError(
             f'transport.qos."{late[0]}".durability = "transient_local": a robot that starts would obey an old '

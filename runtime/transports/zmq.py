@@ -51,10 +51,10 @@ class Config(NodeSettings):
 
 def is_loopback(endpoint: str) -> bool:
     """Return True if the endpoint cannot be reached from another machine."""
-    scheme, _, rest = endpoint.partition("://")
+    scheme, _, address = endpoint.partition("://")
     if scheme in {"ipc", "inproc"}:
         return True
-    host = rest.rpartition(":")[0].strip("[]")
+    host = address.rpartition(":")[0].strip("[]")
     if host == "localhost":
         return True
     with contextlib.suppress(ValueError):
@@ -85,11 +85,12 @@ def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
 
 def source(config: Config, robot: Robot, clock: Clock) -> NodeSource:
     """Create the source of the node's observations. Raises ConfigurationError for an unknown disabled camera."""
-    known = [camera.key for camera in robot.cameras]
-    unknown = [key for key in config.disabled_cameras if key not in known]
+    robot_cameras = [camera.key for camera in robot.cameras]
+    unknown = [key for key in config.disabled_cameras if key not in robot_cameras]
     if unknown:
         raise ConfigurationError(
-            f"transport.disabled_cameras = {unknown} are no cameras of {robot.name}; allowed: {', '.join(known)}"
+            f"transport.disabled_cameras = {unknown} are no cameras of {robot.name}; "
+            f"allowed: {', '.join(robot_cameras)}"
         )
     return NodeSource(config, robot, clock)
 

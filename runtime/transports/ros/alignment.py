@@ -91,29 +91,29 @@ class Alignment(Generic[Value]):
 
     def add(self, stream: str, sample: Sample[Value]) -> bool:
         """Add a sample; return False, without adding it, if it is not newer than the newest of its stream."""
-        kept = self._samples[stream]
-        if kept and sample.stamp <= kept[-1].stamp:
+        samples = self._samples[stream]
+        if samples and sample.stamp <= samples[-1].stamp:
             return False
-        kept.append(sample)
-        while kept[0].stamp < sample.stamp - self._history:
-            kept.popleft()
+        samples.append(sample)
+        while samples[0].stamp < sample.stamp - self._history:
+            samples.popleft()
         return True
 
     def newest(self, stream: str) -> Sample[Value] | None:
         """Return the newest sample of a stream, or None."""
-        kept = self._samples[stream]
-        return kept[-1] if kept else None
+        samples = self._samples[stream]
+        return samples[-1] if samples else None
 
     def clear(self) -> None:
         """Drop all samples, because the senders' clock has been set."""
-        for kept in self._samples.values():
-            kept.clear()
+        for samples in self._samples.values():
+            samples.clear()
 
     def newest_common_time(self) -> float | None:
         """Return the newest time that all streams have reached; None while one of them has no sample."""
         if not all(self._samples.values()):
             return None
-        return min(kept[-1].stamp for kept in self._samples.values())
+        return min(samples[-1].stamp for samples in self._samples.values())
 
     def frame(self, after: Aligned[Value] | None = None) -> Aligned[Value] | None:
         """Return the newest frame, or None if there is none that is newer than `after`, the last frame of this reader.
@@ -123,7 +123,7 @@ class Alignment(Generic[Value]):
         time = self.newest_common_time()
         if time is None or (after is not None and time <= after.time):
             return None
-        chosen = {name: _nearest(kept, time) for name, kept in self._samples.items()}
+        chosen = {name: _nearest(samples, time) for name, samples in self._samples.items()}
         if any(abs(sample.stamp - time) > self._window for sample in chosen.values()):
             return None
         if after is not None and all(sample is after.samples[name] for name, sample in chosen.items()):
@@ -137,19 +137,19 @@ class Alignment(Generic[Value]):
             return []
         return [
             name
-            for name, kept in self._samples.items()
-            if abs(_nearest(kept, time).stamp - time) > self._window
+            for name, samples in self._samples.items()
+            if abs(_nearest(samples, time).stamp - time) > self._window
         ]
 
 
-def _nearest(kept: deque[Sample[Value]], time: float) -> Sample[Value]:
+def _nearest(samples: deque[Sample[Value]], time: float) -> Sample[Value]:
     """Return the sample nearest to `time`, the older of two at the same distance.
 
     The search starts from the newest sample.
     """
     # Stamps increase, so after the first sample that is further away all older ones are, too.
-    best = kept[-1]
-    for sample in reversed(kept):
+    best = samples[-1]
+    for sample in reversed(samples):
         if abs(sample.stamp - time) > abs(best.stamp - time):
             break
         best = sample

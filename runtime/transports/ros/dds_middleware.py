@@ -50,14 +50,14 @@ def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
         return None
     local = network == LOOPBACK
     interface = 'name="lo" multicast="false"' if local else _interface(network)
-    found = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in (("127.0.0.1",) if local else peers))
+    addresses = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in (("127.0.0.1",) if local else peers))
     return (
         "<CycloneDDS><Domain><General>"
         f"<Interfaces><NetworkInterface {interface}/></Interfaces>"
         + ("<AllowMulticast>false</AllowMulticast>" if local else "")
         + "</General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
         "<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
-        + (f"<Peers>{found}</Peers>" if found else "")
+        + (f"<Peers>{addresses}</Peers>" if addresses else "")
         + f'</Discovery><Internal><SocketReceiveBufferSize max="{_RECEIVED}"/></Internal></Domain></CycloneDDS>'
     )
 
@@ -172,19 +172,19 @@ class DdsMiddleware(Middleware):
 
         with self._lock:
             readers = [(topic, reader) for topic, reader, _ in self._readers]
-        found: dict[str, Match] = {}
+        matches: dict[str, Match] = {}
         try:
             for topic, reader in readers:
                 peers = len(reader.get_matched_publications())
                 status = reader.get_requested_incompatible_qos_status()
-                found[topic.name] = Match(peers, self._refused(topic, status, peers, False))
+                matches[topic.name] = Match(peers, self._refused(topic, status, peers, False))
             for topic, writer in self._writers:
                 peers = len(writer.get_matched_subscriptions())
                 status = writer.get_offered_incompatible_qos_status()
-                found[topic.name] = Match(peers, self._refused(topic, status, peers, True))
+                matches[topic.name] = Match(peers, self._refused(topic, status, peers, True))
         except DDSException as error:
             raise TransportError(f"DDS does not say who is at the other side: {error}") from error
-        return found
+        return matches
 
     def close(self) -> None:
         """End the thread, then the participant with all its readers and writers."""
@@ -238,9 +238,9 @@ class DdsMiddleware(Middleware):
 
     def _refused(self, topic: Topic, status: Any, peers: int, publishes: bool) -> str:
         """Return why a peer of the topic was refused, "" if no peer was."""
-        other = "" if peers else self._otherwise_typed(topic, publishes)
-        if other or not status.total_count:
-            return other
+        mismatch = "" if peers else self._otherwise_typed(topic, publishes)
+        if mismatch or not status.total_count:
+            return mismatch
         return describe_incompatible(
             topic, _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}"), publishes
         )
@@ -256,13 +256,13 @@ class DdsMiddleware(Middleware):
             BuiltinTopicDcpsSubscription,
         )
 
-        others = BuiltinTopicDcpsSubscription if publishes else BuiltinTopicDcpsPublication
-        wanted = _type_name(topic)
-        for endpoint in BuiltinDataReader(self._participant, others).read(_MOST_ENDPOINTS):
-            kind = getattr(endpoint, "type_name", wanted)  # absent for an endpoint that has left
-            if kind != wanted and endpoint.topic_name == f"rt{topic.name}":
+        peer_topic = BuiltinTopicDcpsSubscription if publishes else BuiltinTopicDcpsPublication
+        type_name = _type_name(topic)
+        for endpoint in BuiltinDataReader(self._participant, peer_topic).read(_MOST_ENDPOINTS):
+            kind = getattr(endpoint, "type_name", type_name)  # absent for an endpoint that has left
+            if kind != type_name and endpoint.topic_name == f"rt{topic.name}":
                 verb = "subscribed to" if publishes else "published"
-                return f"{topic.name} is {verb} as {_ros_name(kind)}; expected {_ros_name(wanted)}"
+                return f"{topic.name} is {verb} as {_ros_name(kind)}; expected {_ros_name(type_name)}"
         return ""
 
 
@@ -291,13 +291,13 @@ def _quality(topic: Topic, life: bool) -> Any:
 
     from runtime.transports.ros.idl import HASHES
 
-    asked = topic.quality
-    reliable = asked.reliability == "reliable"
+    requested = topic.quality
+    reliable = requested.reliability == "reliable"
     policies = [
         Policy.Reliability.Reliable(duration(milliseconds=1)) if reliable else Policy.Reliability.BestEffort,
-        Policy.History.KeepLast(asked.depth),
+        Policy.History.KeepLast(requested.depth),
         Policy.Durability.TransientLocal
-        if asked.durability == "transient_local"
+        if requested.durability == "transient_local"
         else Policy.Durability.Volatile,
         Policy.DataRepresentation(use_cdrv0_representation=True),
         Policy.Userdata(f"typehash={HASHES[topic.message]};".encode()),

@@ -178,26 +178,26 @@ def write(message: Message, out: Writer) -> bytes:
     return out.done()
 
 
-def _joint_state(given: Reader) -> JointState:
-    stamp, frame = given.header()
-    return JointState(stamp, frame, given.strings(), given.doubles(), given.doubles(), given.doubles())
+def _joint_state(reader: Reader) -> JointState:
+    stamp, frame = reader.header()
+    return JointState(stamp, frame, reader.strings(), reader.doubles(), reader.doubles(), reader.doubles())
 
 
-def _image(given: Reader) -> Image:
-    stamp, frame = given.header()
-    height, width, encoding = given.u32(), given.u32(), given.string()
-    given.u8()  # is_bigendian has no meaning for bytes
-    return Image(stamp, frame, height, width, encoding, given.u32(), given.octets())
+def _image(reader: Reader) -> Image:
+    stamp, frame = reader.header()
+    height, width, encoding = reader.u32(), reader.u32(), reader.string()
+    reader.u8()  # is_bigendian has no meaning for bytes
+    return Image(stamp, frame, height, width, encoding, reader.u32(), reader.octets())
 
 
-def _compressed(given: Reader) -> CompressedImage:
-    stamp, frame = given.header()
-    return CompressedImage(stamp, frame, given.string(), given.octets())
+def _compressed(reader: Reader) -> CompressedImage:
+    stamp, frame = reader.header()
+    return CompressedImage(stamp, frame, reader.string(), reader.octets())
 
 
-def _pose(given: Reader) -> PoseStamped:
-    stamp, frame = given.header()
-    return PoseStamped(stamp, frame, given.doubles(7))
+def _pose(reader: Reader) -> PoseStamped:
+    stamp, frame = reader.header()
+    return PoseStamped(stamp, frame, reader.doubles(7))
 
 
 _READ: dict[MessageName, Callable[[Reader], Message]] = {

@@ -56,16 +56,16 @@ class JointOrder:
         )
 
     def _indices(self, message: JointState) -> list[int]:
-        wanted, size = self._part.joints, len(message.position)
+        expected, size = self._part.joints, len(message.position)
         if not self._check or not message.names:
-            enough = size >= len(wanted) if not self._check else size == len(wanted)
+            enough = size >= len(expected) if not self._check else size == len(expected)
             if not enough:
                 raise UnusableMessage(
                     "wrong_dimension",
                     f"{size} positions {'without names' if not message.names else ''} came; "
-                    f"expected {len(wanted)}: {', '.join(wanted)}",
+                    f"expected {len(expected)}: {', '.join(expected)}",
                 )
-            return list(range(len(wanted)))
+            return list(range(len(expected)))
         if len(message.names) != size:
             raise UnusableMessage("wrong_dimension", f"{len(message.names)} names came with {size} positions")
         if message.names != self._seen:
@@ -74,17 +74,19 @@ class JointOrder:
         return self._order
 
     def _ordered(self, names: tuple[str, ...]) -> list[int]:
-        wanted = self._part.joints
-        missing = [name for name in wanted if name not in names]
-        twice = [name for name in wanted if names.count(name) > 1]
-        if missing or twice:
-            wrong = f"lack {', '.join(missing)}" if missing else f"have {', '.join(twice)} more than once"
+        expected = self._part.joints
+        missing = [name for name in expected if name not in names]
+        duplicates = [name for name in expected if names.count(name) > 1]
+        if missing or duplicates:
+            wrong = (
+                f"lack {', '.join(missing)}" if missing else f"have {', '.join(duplicates)} more than once"
+            )
             raise UnusableMessage(
                 "joint_names",
-                f"the joints {', '.join(names)} {wrong}; expected {', '.join(wanted)} "
+                f"the joints {', '.join(names)} {wrong}; expected {', '.join(expected)} "
                 f"({self._key} says what messages call them)",
             )
-        return [names.index(name) for name in wanted]
+        return [names.index(name) for name in expected]
 
 
 def _optional_values(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
@@ -100,9 +102,9 @@ def pose(message: PoseStamped, frame: str) -> Float32:
 
     Raises UnusableMessage if it is in another frame than `frame`, not finite, or its quaternion is not of unit length.
     """
-    given = message.frame.lstrip("/")
-    if frame and given and given != frame:
-        raise UnusableMessage("wrong_frame", f"a pose is given in {given}; expected {frame}")
+    message_frame = message.frame.lstrip("/")
+    if frame and message_frame and message_frame != frame:
+        raise UnusableMessage("wrong_frame", f"a pose is given in {message_frame}; expected {frame}")
     numbers = message.pose
     length = float(np.linalg.norm(numbers[3:]))
     if not np.isfinite(numbers).all() or abs(length - 1.0) > 0.05:
@@ -160,16 +162,16 @@ def _raw(message: Image) -> UInt8:
     _check_raw(message)
     channels, size = _CHANNELS[message.encoding], message.step * message.height
     rows = message.data[:size].reshape(message.height, message.step)[:, : message.width * channels]
-    given = rows.reshape(message.height, message.width, channels)
+    image = rows.reshape(message.height, message.width, channels)
     if message.encoding == "rgb8":
-        return given.copy()
+        return image.copy()
     code = {
         "bgr8": cv2.COLOR_BGR2RGB,
         "mono8": cv2.COLOR_GRAY2RGB,
         "rgba8": cv2.COLOR_RGBA2RGB,
         "bgra8": cv2.COLOR_BGRA2RGB,
     }[message.encoding]
-    return np.asarray(cv2.cvtColor(given, code), np.uint8)
+    return np.asarray(cv2.cvtColor(image, code), np.uint8)
 
 
 def _kind_of(message: CompressedImage) -> Literal["jpeg", "png"] | None:

@@ -77,10 +77,10 @@ class Middleware(ABC):
 
 def describe_incompatible(topic: Topic, policy: str, publishes: bool) -> str:
     """Return the sentence about a peer that was refused because of a quality-of-service policy."""
-    side, other = ("publish", "a subscriber") if publishes else ("subscribe to", "a publisher")
-    ours = topic.quality.model_dump()
-    given = ours.get(policy, "as is")
+    side, peer = ("publish", "a subscriber") if publishes else ("subscribe to", "a publisher")
+    requested = topic.quality.model_dump()
+    value = requested.get(policy, "as is")
     return (
-        f"{other} of {topic.name} is incompatible in its {policy}: we {side} it with {policy} = {given}; "
+        f"{peer} of {topic.name} is incompatible in its {policy}: we {side} it with {policy} = {value}; "
         f'change transport.qos."{topic.name}".{policy}, or the robot\'s side'
     )

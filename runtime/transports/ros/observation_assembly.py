@@ -97,16 +97,16 @@ class Assembly:
         return [part for part in self._parts if part.kind == kind]
 
     def _picture(self, part: StreamSpec, got: StampedValue) -> UInt8:
-        known = self._decoded.get(part.source_key)
-        if known is not None and known[0] is got:
-            return known[1]
+        cached = self._decoded.get(part.source_key)
+        if cached is not None and cached[0] is got:
+            return cached[1]
         assert isinstance(got.value, Image | CompressedImage)
         try:
-            made = message_reading.picture(got.value)
+            decoded = message_reading.picture(got.value)
         except UnusableMessage as error:
             raise UnusableMessage(error.fault, f"{part.topic}: {error}") from error
-        self._decoded[part.source_key] = (got, made)
-        return made
+        self._decoded[part.source_key] = (got, decoded)
+        return decoded
 
     def _captured(
         self, values: Mapping[str, StampedValue], pictures: Mapping[str, UInt8]
@@ -120,8 +120,10 @@ class Assembly:
             times["eef"] = min(values[part.name].captured for part in poses)
         for part in self._stream("camera"):
             time = values[part.name].captured
-            shown = {part.source_key: pictures[part.source_key]}
-            times |= self._freshness.captured(shown, time) if self._detect_frozen else {part.source_key: time}
+            single = {part.source_key: pictures[part.source_key]}
+            times |= (
+                self._freshness.captured(single, time) if self._detect_frozen else {part.source_key: time}
+            )
         return times
 
     def _vectors(self, values: Mapping[str, Value]) -> tuple[Float32, Float32 | None, Float32 | None]:
@@ -173,5 +175,5 @@ def _insert_gripper(arm: Float64 | None, hand: Float64 | None, place: int | None
 
 
 def _joined(parts: list[Float64 | None]) -> Float32 | None:
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known).astype(np.float32) if len(known) == len(parts) else None
+    available = [part for part in parts if part is not None]
+    return np.concatenate(available).astype(np.float32) if len(available) == len(parts) else None

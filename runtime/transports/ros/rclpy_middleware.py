@@ -92,18 +92,18 @@ class RclMiddleware(Middleware):
 
     def matches(self) -> Mapping[str, Match]:
         """Return by topic the number of peers in the ROS graph, and why another was refused, e.g. its message type."""
-        found = {}
+        matches = {}
         for name, topic in self._subscribed.items():
-            wanted = f"{PACKAGES[topic.message]}/msg/{topic.message}"
-            kinds = [one.topic_type for one in self._node.get_publishers_info_by_topic(name)]
-            others = [kind for kind in kinds if kind != wanted]
+            expected = f"{PACKAGES[topic.message]}/msg/{topic.message}"
+            kinds = [endpoint.topic_type for endpoint in self._node.get_publishers_info_by_topic(name)]
+            mismatched = [kind for kind in kinds if kind != expected]
             refused = self._refused.get(name, "")
-            if others and wanted not in kinds:
-                refused = refused or f"{name} is published as {others[0]}; expected {wanted}"
-            found[name] = Match(kinds.count(wanted), refused)
+            if mismatched and expected not in kinds:
+                refused = refused or f"{name} is published as {mismatched[0]}; expected {expected}"
+            matches[name] = Match(kinds.count(expected), refused)
         for name, (_, publisher) in self._advertised.items():
-            found[name] = Match(publisher.get_subscription_count(), self._refused.get(name, ""))
-        return found
+            matches[name] = Match(publisher.get_subscription_count(), self._refused.get(name, ""))
+        return matches
 
     def close(self) -> None:
         """End the thread, the node and its context."""
@@ -152,14 +152,14 @@ def _quality(topic: Topic, publishes: bool) -> Any:
 
     from runtime.transports.ros.middleware import COMMAND_LIFE_S
 
-    asked = topic.quality
-    reliable, kept = asked.reliability == "reliable", asked.durability == "transient_local"
-    made = QoSProfile(
+    requested = topic.quality
+    reliable, latched = requested.reliability == "reliable", requested.durability == "transient_local"
+    profile = QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=asked.depth,
+        depth=requested.depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
     if publishes:
-        made.lifespan = Duration(seconds=COMMAND_LIFE_S)
-    return made
+        profile.lifespan = Duration(seconds=COMMAND_LIFE_S)
+    return profile

@@ -57,9 +57,9 @@ class Writer(fields.Writer):
 
 def decode(name: MessageName, payload: bytes) -> Message:
     """Decode a message of the given type. Raises CodecError for invalid or surplus bytes."""
-    given = Reader(payload)
-    message = fields.read(name, given)
-    given.end()
+    reader = Reader(payload)
+    message = fields.read(name, reader)
+    reader.end()
     return message
 
 

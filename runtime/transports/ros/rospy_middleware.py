@@ -68,12 +68,12 @@ class TcpRosMiddleware(Middleware):
         known.
         """
         with self._lock:
-            found = {}
+            matches = {}
             for index, (topic, _) in enumerate(self._topics):
                 peers, refused = self._peers.get(index, (0, ""))
-                why = "" if peers else self._unopened.get(index) or self._trouble or refused
-                found[topic.name] = Match(peers, why)
-            return found
+                reason = "" if peers else self._unopened.get(index) or self._trouble or refused
+                matches[topic.name] = Match(peers, reason)
+            return matches
 
     @property
     def pid(self) -> int | None:

@@ -47,12 +47,12 @@ class RosEnvironment:
     @property
     def environment(self) -> dict[str, str]:
         """Environment variables for the child: those of this process, with those that rospy reads replaced."""
-        kept = {
+        inherited = {
             name: value
             for name, value in os.environ.items()
             if name not in ("ROS_HOSTNAME", "ROS_NAMESPACE", "ROS_PYTHON_LOG_CONFIG_FILE")
         }
-        return kept | {"ROS_MASTER_URI": self.master, "ROS_IP": self.address}
+        return inherited | {"ROS_MASTER_URI": self.master, "ROS_IP": self.address}
 
 
 @functools.cache  # cache: to look starts a process
@@ -60,14 +60,14 @@ def require(python: str) -> None:
     """Raise SetupError with an instruction unless `python` exists and has rospy; a success is cached."""
     line = [python, str(_PROGRAM), json.dumps({"check": True})]
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             line, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_START_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise SetupError(f"transport.python = {python!r} cannot be run: {error}; {_INSTALL}") from error
-    if done.returncode:
-        said = (done.stderr.strip().splitlines() or [f"it ended with {done.returncode}"])[-1]
-        raise SetupError(f"ROS 1 needs rospy, which {python} (transport.python) lacks: {said}; {_INSTALL}")
+    if completed.returncode:
+        message = (completed.stderr.strip().splitlines() or [f"it ended with {completed.returncode}"])[-1]
+        raise SetupError(f"ROS 1 needs rospy, which {python} (transport.python) lacks: {message}; {_INSTALL}")
 
 
 class RospyProcess:
@@ -135,9 +135,9 @@ class RospyProcess:
 
     def interrupt(self) -> None:
         """Make `read_messages` return; call it from another thread."""
-        for one in (self._telling, self._commands):
+        for connection in (self._telling, self._commands):
             with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
 
     def stop(self) -> int:
         """Close the sockets and wait until the child has deregistered; return its exit code."""

@@ -48,8 +48,8 @@ class RosSink(Sink):
         self.close()
         self._middleware = middleware = self._open()
         self._publish = [
-            (one, middleware.advertise(Topic(one.topic, one.message, self._quality(one.topic))))
-            for one in self._outlets
+            (outlet, middleware.advertise(Topic(outlet.topic, outlet.message, self._quality(outlet.topic))))
+            for outlet in self._outlets
         ]
 
     def send(self, command: RobotCommand) -> None:
@@ -71,7 +71,9 @@ class RosSink(Sink):
         # `command.time` is on our monotonic clock; the stamp is the wall clock at the same moment.
         stamp = self._wall() - round((self._clock.now() - command.time) * 1e9)
         # Encode all messages before sending the first: a command reaches every group or none.
-        messages = [self._wire.encode(self._message(one, stamp, action, eef)) for one, _ in self._publish]
+        messages = [
+            self._wire.encode(self._message(outlet, stamp, action, eef)) for outlet, _ in self._publish
+        ]
         for (_, publish), payload in zip(self._publish, messages, strict=True):
             publish(payload)
 
@@ -96,11 +98,11 @@ class RosSink(Sink):
         return PoseStamped(stamp, outlet.frame, eef[outlet.arm, [0, 1, 2, 4, 5, 6, 3]])
 
 
-def _finite(numbers: Float32, width: int, what: str) -> Float32:
-    given = np.asarray(numbers, np.float32)
-    if given.shape != (width,) or not np.isfinite(given).all():
+def _finite(numbers: Float32, width: int, label: str) -> Float32:
+    vector = np.asarray(numbers, np.float32)
+    if vector.shape != (width,) or not np.isfinite(vector).all():
         raise TransportError(
-            f"{what} of shape {list(given.shape)} {given.tolist()} was to be sent; "
+            f"{label} of shape {list(vector.shape)} {vector.tolist()} was to be sent; "
             f"allowed: {width} finite numbers"
         )
-    return given
+    return vector

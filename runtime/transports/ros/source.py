@@ -95,8 +95,10 @@ class RosSource(Source):
     ) -> None:
         self._robot, self._heard, self._terms, self._clock = robot, heard, terms, clock
         self._wire, self._open = wire, open_middleware
-        self._parts = tuple(part for one in heard for part in one.parts)
-        self._topics = {part.name: one.topic for one in heard for part in one.parts}
+        self._parts = tuple(part for subscription in heard for part in subscription.parts)
+        self._topics = {
+            part.name: subscription.topic for subscription in heard for part in subscription.parts
+        }
         self._middleware: Middleware | None = None
         self._changed = threading.Condition()
         self._forget()
@@ -107,8 +109,8 @@ class RosSource(Source):
         self._forget()
         self._began = self._framed_at = self._clock.now()
         self._middleware = self._open()
-        for one in self._heard:
-            self._middleware.subscribe(one.topic, self._make_callback(one))
+        for subscription in self._heard:
+            self._middleware.subscribe(subscription.topic, self._make_callback(subscription))
 
     def receive(self, timeout: float) -> Observation | None:
         """Return the newest frame that was not delivered yet, as RGB; None after `timeout` [s] without one."""
@@ -125,14 +127,14 @@ class RosSource(Source):
         self._count += 1
         self._framed_at = self._clock.now()
         try:
-            made = self._assembly.observation(self._count, aligned)
+            observation = self._assembly.observation(self._count, aligned)
         except UnusableMessage as error:
             self._count_fault(error.fault, str(error))
             return None
         for camera in self._assembly.newly_frozen(self._clock.now()):
             self._count_fault(f"frozen_{camera}", _FROZEN(camera=camera, seconds=FROZEN_S))
         self._told.clear()
-        return made
+        return observation
 
     def close(self) -> None:
         """Stop listening."""
@@ -155,8 +157,8 @@ class RosSource(Source):
 
     def pop_events(self) -> list[Event]:
         """Return events on why no frame arrives: streams are silent (with age and peers), or too far apart in time."""
-        told, self._news = self._news, []
-        return told
+        events, self._news = self._news, []
+        return events
 
     def stalled(self) -> dict[str, float]:
         """Return by stream without a usable message for too long the age of its newest message [s].
@@ -195,17 +197,19 @@ class RosSource(Source):
         self._count = 0
         self._began = self._framed_at = self._look_at = 0.0
 
-    def _make_callback(self, one: Subscription) -> Callable[[bytes], None]:
+    def _make_callback(self, subscription: Subscription) -> Callable[[bytes], None]:
         def take(payload: bytes) -> None:
             arrived = self._clock.now()
             try:
-                message = self._wire.decode(one.topic.message, payload)
+                message = self._wire.decode(subscription.topic.message, payload)
             except CodecError as error:
                 self._count_fault(
-                    "malformed", f"{one.topic.name}: {error}", *(part.name for part in one.parts)
+                    "malformed",
+                    f"{subscription.topic.name}: {error}",
+                    *(part.name for part in subscription.parts),
                 )
                 return
-            for part in one.parts:
+            for part in subscription.parts:
                 self._store_message(part, message, arrived)
 
         return take
@@ -224,14 +228,14 @@ class RosSource(Source):
             return
         with self._changed:
             before, leaps = self._ros.backwards, self._ros.forwards
-            ours = self._ros.to_monotonic(part.name, stamp, arrived)
+            monotonic_stamp = self._ros.to_monotonic(part.name, stamp, arrived)
             if self._ros.backwards > before:
                 self.alignment.clear()
                 self._cursor = None
                 self._sentences["clock_backwards"] = _BACK(stream=part.name)
             if self._ros.forwards > leaps:
                 self._sentences["clock_forwards"] = _AHEAD(stream=part.name)
-            if self.alignment.add(part.name, Sample(stamp, arrived, StampedValue(value, ours))):
+            if self.alignment.add(part.name, Sample(stamp, arrived, StampedValue(value, monotonic_stamp))):
                 self._heard_at[part.name] = arrived
                 self._refusals.pop(part.name, None)
                 self._changed.notify_all()
@@ -280,9 +284,11 @@ class RosSource(Source):
         except TransportError as error:
             log.warning("%s", error)
             matches = {}
-        found = {name: matches.get(self._topics[name].name, Match(1)) for name in stalled}
-        causes = {name: {self._reason(name), f"{name}: {found[name].refused}"} for name in found}
-        fresh = {name: found[name] for name in found if not causes[name] <= self._told}
+        stalled_matches = {name: matches.get(self._topics[name].name, Match(1)) for name in stalled}
+        causes = {
+            name: {self._reason(name), f"{name}: {stalled_matches[name].refused}"} for name in stalled_matches
+        }
+        fresh = {name: stalled_matches[name] for name in stalled_matches if not causes[name] <= self._told}
         for name in fresh:
             self._told |= causes[name]
         shared = {match.refused for match in fresh.values()}
@@ -307,11 +313,11 @@ class RosSource(Source):
     def _silence(self, name: str, age: float, match: Match) -> str:
         topic = self._topics[name].name
         refusal = self._refusals.get(name)
-        why = match.refused or ("" if match.peers else _NO_PUBLISHER)
+        reason = match.refused or ("" if match.peers else _NO_PUBLISHER)
         if refusal is not None:
-            why = refusal[1]
-        what = (_SILENT if refusal is None else _UNUSABLE)(stream=name, topic=topic, seconds=age)
-        return _BECAUSE(what=what, why=why) if why else what
+            reason = refusal[1]
+        text = (_SILENT if refusal is None else _UNUSABLE)(stream=name, topic=topic, seconds=age)
+        return _BECAUSE(what=text, why=reason) if reason else text
 
     def _distance(self, apart: list[str]) -> str:
         newest = {part.name: self.alignment.newest(part.name) for part in self._parts}
@@ -338,15 +344,15 @@ def subscriptions(
     by_topic: dict[str, list[StreamSpec]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)
-    for topic, found in by_topic.items():
-        kinds = sorted({part.message for part in found})
+    for topic, topic_parts in by_topic.items():
+        kinds = sorted({part.message for part in topic_parts})
         if len(kinds) > 1:
-            names = ", ".join(part.name for part in found)
+            names = ", ".join(part.name for part in topic_parts)
             raise ConfigurationError(
                 f"transport: {topic} is the topic of {names}, which are {' and '.join(kinds)}; "
                 "allowed: one type of message per topic"
             )
     return tuple(
-        Subscription(Topic(topic, found[0].message, quality(topic)), tuple(found))
-        for topic, found in by_topic.items()
+        Subscription(Topic(topic, topic_parts[0].message, quality(topic)), tuple(topic_parts))
+        for topic, topic_parts in by_topic.items()
     )

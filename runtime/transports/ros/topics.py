@@ -98,13 +98,13 @@ class TopicPlan:
 
     def streams(self, eef: bool) -> tuple[StreamSpec, ...]:
         """Return all streams of a frame; if `eef`, with those of measured poses."""
-        made = [self._camera(camera) for camera in self.cameras]
+        specs = [self._camera(camera) for camera in self.cameras]
         for group in self._robot.groups:
-            made += self._state(group)
+            specs += self._state(group)
             if eef and group.chain is not None:
                 topic = self._required(group, "eef", "eef = true needs the poses of every arm")
-                made.append(StreamSpec("eef", group.name, topic, "PoseStamped"))
-        return tuple(made)
+                specs.append(StreamSpec("eef", group.name, topic, "PoseStamped"))
+        return tuple(specs)
 
     def command_topics(self, targets: Sequence[Target], eef: bool) -> tuple[CommandTopic, ...]:
         """Return the command topics, which carry poses if `eef`, in the order of the targets.
@@ -175,8 +175,8 @@ class TopicPlan:
             yield CommandTopic(topic, "JointState", dims, names)
 
     def _names(self, group: Group) -> tuple[str, ...]:
-        given = self._given.groups.get(group.name)
-        return group.joints if given is None or given.joints is None else tuple(given.joints)
+        names = self._given.groups.get(group.name)
+        return group.joints if names is None or names.joints is None else tuple(names.joints)
 
     def _check_joints(self, group: Group) -> None:
         names = self._names(group)
@@ -188,17 +188,17 @@ class TopicPlan:
 
     def _topic(self, group: Group, field: str) -> str:
         """Return the group's topic in the setting `field`, "" if it has none."""
-        given = getattr(self._given.groups.get(group.name), field, None)
-        if given is None and self._own is not None:
-            given = getattr(self._own.groups.get(group.name), field, None)
-        return str(given or "")
+        topic = getattr(self._given.groups.get(group.name), field, None)
+        if topic is None and self._own is not None:
+            topic = getattr(self._own.groups.get(group.name), field, None)
+        return str(topic or "")
 
-    def _required(self, group: Group, field: str, why: str) -> str:
+    def _required(self, group: Group, field: str, reason: str) -> str:
         topic = self._topic(group, field)
         if not topic:
             raise ConfigurationError(
                 f"transport: no {field} topic of group {group.name} is known; needed: "
-                f"transport.topics.groups.{group.name}.{field} ({why})"
+                f"transport.topics.groups.{group.name}.{field} ({reason})"
             )
         return topic
 
@@ -220,9 +220,9 @@ def _merged(before: CommandTopic | None, outlet: CommandTopic) -> CommandTopic:
 
 
 def _require_known(
-    key: str, given: Mapping[str, object] | list[str], allowed: list[str], robot: Robot
+    key: str, names: Mapping[str, object] | list[str], allowed: list[str], robot: Robot
 ) -> None:
-    unknown = [name for name in given if name not in allowed]
+    unknown = [name for name in names if name not in allowed]
     if unknown:
         raise ConfigurationError(
             f"transport.{key}: {', '.join(unknown)} not of {robot.name}; allowed: {', '.join(allowed)}"

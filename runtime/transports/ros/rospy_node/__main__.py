@@ -55,7 +55,7 @@ def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None)
     """
     try:
         with xmlrpc.client.ServerProxy(address, transport=_Bounded()) as proxy:
-            code, said, value = getattr(proxy, method)("/eva_web", *arguments)
+            code, message, value = getattr(proxy, method)("/eva_web", *arguments)
     except OSError as error:
         raise NoXmlRpcAnswer(error.strerror or str(error) or type(error).__name__) from error
     except Exception as error:
@@ -63,7 +63,7 @@ def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None)
     if code == 1:
         return value
     if default is None:
-        raise NoXmlRpcAnswer(said)
+        raise NoXmlRpcAnswer(message)
     return default
 
 
@@ -119,26 +119,30 @@ class Topics:
     def subscribe(self, index: int, name: str, kind: str, queue: int) -> None:
         import rospy
 
-        made, size = raw(kind), BUFFER.get(kind.rpartition("/")[2], BUFFER_OF_NUMBERS)
-        self.open[index] = (name, made, None)
+        message_class, size = raw(kind), BUFFER.get(kind.rpartition("/")[2], BUFFER_OF_NUMBERS)
+        self.open[index] = (name, message_class, None)
         subscriber = rospy.Subscriber(
-            name, made, lambda message: self._parent.message(index, message._buff),
+            name, message_class, lambda message: self._parent.message(index, message._buff),
             queue_size=queue, buff_size=size, tcp_nodelay=True,
         )  # fmt: skip
-        self.open[index] = (name, made, subscriber)
+        self.open[index] = (name, message_class, subscriber)
 
     def advertise(self, index: int, name: str, kind: str, queue: int) -> None:
         import rospy
 
-        made = raw(kind)
-        self.open[index] = (name, made, rospy.Publisher(name, made, queue_size=queue, tcp_nodelay=True))
+        message_class = raw(kind)
+        self.open[index] = (
+            name,
+            message_class,
+            rospy.Publisher(name, message_class, queue_size=queue, tcp_nodelay=True),
+        )
         self._counts[index] = 0
 
     def publish(self, index: int, payload: bytes) -> None:
         """Publish a message with the sequence number in its header that rospy would write."""
         self._counts[index] = (self._counts[index] + 1) % (1 << 32)
-        _, made, publisher = self.open[index]
-        message = made()
+        _, message_class, publisher = self.open[index]
+        message = message_class()
         message._buff = struct.pack("<I", self._counts[index]) + payload[4:]
         publisher.publish(message)
 
@@ -150,8 +154,12 @@ class Topics:
         opened = self.open[index][2]
         if opened is None:
             return 0
-        found = list(opened.impl.connections)
-        return sum(1 for one in found if self.publishes(index) or (one.socket is not None and one.md5sum))
+        connections = list(opened.impl.connections)
+        return sum(
+            1
+            for connection in connections
+            if self.publishes(index) or (connection.socket is not None and connection.md5sum)
+        )
 
 
 def raw(kind: str) -> Any:
@@ -201,12 +209,12 @@ class PeerMonitor:
 
     def _poll(self) -> None:
         try:
-            who, uri = self._who(), call_xmlrpc(self._master, "lookupNode", self._name, default="")
+            identity, uri = self._who(), call_xmlrpc(self._master, "lookupNode", self._name, default="")
         except NoXmlRpcAnswer as error:
             self._trouble = f"the ROS master at {self._master} does not answer: {error}"
             return
         self._trouble = ""
-        if who != self._identity or uri != self._uri:
+        if identity != self._identity or uri != self._uri:
             self._parent.send_word(
                 anew=f"the ROS master at {self._master} is another than before, and does not know us"
             )
@@ -223,48 +231,48 @@ class PeerMonitor:
             for index in lonely:
                 spoken = self._topics.publishes(index)
                 name = self._topics.open[index][0]
-                others = [
+                peers = [
                     n for t, nodes in (subscribers if spoken else publishers) if t == name for n in nodes
                 ]
-                others = [node for node in others if node != self._name]
-                if others:
-                    self._refused[index] = self._absence(index, others[0], spoken)
+                peers = [node for node in peers if node != self._name]
+                if peers:
+                    self._refused[index] = self._absence(index, peers[0], spoken)
 
     def _absence(self, index: int, node: str, spoken: bool) -> str:
         """Return why `node`, which the master lists for the topic, is not connected; `spoken`: this process publishes
         it.
         """
-        name, made, _ = self._topics.open[index]
+        name, message_class, _ = self._topics.open[index]
         verb = "subscribes to" if spoken else "publishes"
         try:
             uri = call_xmlrpc(self._master, "lookupNode", node)
         except NoXmlRpcAnswer as error:
             return f"the master says that {node} {verb} {name}, and not where that is: {error}"
         try:
-            said = call_xmlrpc(uri, "getSubscriptions" if spoken else "getPublications")
+            reply = call_xmlrpc(uri, "getSubscriptions" if spoken else "getPublications")
         except NoXmlRpcAnswer as error:
             return (
                 f"{node}, which {verb} {name}, is not to be reached at {uri}: {error}; does it still run, and is its "
                 "ROS_IP or ROS_HOSTNAME an address that is known here?"
             )
-        kinds = [kind for topic, kind in said if topic == name]
-        if kinds and kinds[0] not in (made._type, "*"):
-            told = "subscribed to" if spoken else "published"
-            return f"{name} is {told} as {kinds[0]} by {node}; expected {made._type}"
+        kinds = [kind for topic, kind in reply if topic == name]
+        if kinds and kinds[0] not in (message_class._type, "*"):
+            participle = "subscribed to" if spoken else "published"
+            return f"{name} is {participle} as {kinds[0]} by {node}; expected {message_class._type}"
         if not kinds:
             return f"the master says that {node} {verb} {name}, but {node} does not any more"
         return (
             f"{node} {verb} {name} and is not connected; it has to reach {self._address} (transport.address), and to "
-            f"have the same definition of {made._type}"
+            f"have the same definition of {message_class._type}"
         )
 
     def _report_changes(self) -> None:
         """Report the status to the parent if it has changed."""
-        found = {
+        counts = {
             str(index): [self._topics.peers(index), self._refused.get(index, "")]
             for index in list(self._topics.open)
         }
-        status = {"peers": found, "trouble": self._trouble, "stale": self._topics.stale}
+        status = {"peers": counts, "trouble": self._trouble, "stale": self._topics.stale}
         if status != self._told:
             self._told = status
             self._parent.send_word(**status)
@@ -277,15 +285,15 @@ def run_commands(parent: Parent, topics: Topics, life: float) -> None:
         if not packet:
             return
         if packet[0] == WORD:
-            asked = json.loads(packet[1:])
-            act = topics.advertise if asked.pop("publish") else topics.subscribe
+            request = json.loads(packet[1:])
+            act = topics.advertise if request.pop("publish") else topics.subscribe
             try:
-                act(**asked)
+                act(**request)
             except Exception as error:  # exceptions of rospy for a bad name or definition
-                parent.send_word(unopened=[asked["index"], f"{asked['name']} cannot be opened: {error}"])
+                parent.send_word(unopened=[request["index"], f"{request['name']} cannot be opened: {error}"])
             continue
-        _, index, made = COMMAND.unpack_from(packet)
-        if time.monotonic() - made > life:
+        _, index, created = COMMAND.unpack_from(packet)
+        if time.monotonic() - created > life:
             topics.stale += 1
         elif index in topics.open:
             topics.publish(index, packet[COMMAND.size :])
