@@ -85,10 +85,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--action-endpoint", default="tcp://127.0.0.1:5556", help="where the node takes commands"
     )
     line.add_argument("--fault", default="drive 1: over-current", metavar="TEXT", help="fault: what it says")
-    given = line.parse_args(arguments)
-    if send_word(given.action_endpoint, f"drives_{given.what}", given.fault):
+    options = line.parse_args(arguments)
+    if send_word(options.action_endpoint, f"drives_{options.what}", options.fault):
         return 0
-    print(f"no node listens at {given.action_endpoint}", file=sys.stderr)
+    print(f"no node listens at {options.action_endpoint}", file=sys.stderr)
     return 1
 
 

@@ -133,9 +133,9 @@ class LeaderPublisher:
     def tick(self, seconds: float) -> None:
         """Update the leader from the node's newest observation if there is one, and publish its joints."""
         now = self._clock.now()
-        seen = self._source.receive(0.0)
-        if seen is not None:
-            self._leader.update(seen, now)
+        observation = self._source.receive(0.0)
+        if observation is not None:
+            self._leader.update(observation, now)
         with contextlib.suppress(zmq.Again):  # dropped for a slow subscriber: the next message is newer
             self._socket.send(self._leader.message(now), zmq.NOBLOCK)
 
@@ -177,7 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     import robots
 
     options = parser().parse_args(arguments)
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
         robot = robots.load_robot(options.robot, options.groups)
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with contextlib.closing(publishing):
             source.connect()
             program.announce_ready({"endpoint": publishing.address}, options.ready_file)
-            run(publishing, clock, options.rate, told)
+            run(publishing, clock, options.rate, stop)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2

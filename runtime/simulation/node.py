@@ -62,10 +62,10 @@ class Node:
     def __init__(
         self, robot: Robot, options: argparse.Namespace, clock: Clock, around: Environment | None = None
     ) -> None:
-        known = [camera.key for camera in robot.cameras]
+        robot_cameras = [camera.key for camera in robot.cameras]
         for key in (options.freeze_camera, options.drop_camera):
-            if key is not None and key not in known:
-                raise SetupError(f"{robot.name} has no camera {key!r}; it has {', '.join(known)}")
+            if key is not None and key not in robot_cameras:
+                raise SetupError(f"{robot.name} has no camera {key!r}; it has {', '.join(robot_cameras)}")
         self._robot = robot
         self._options = options
         self._clock = clock
@@ -263,13 +263,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     import robots
 
     options = parser().parse_args(arguments)
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
         node = Node(robots.load_robot(options.robot, options.groups), options, clock)
         with contextlib.closing(node):
             program.announce_ready(node.open(), options.ready_file)
-            run(node, clock, options.rate, told)
+            run(node, clock, options.rate, stop)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2

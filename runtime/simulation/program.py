@@ -39,15 +39,15 @@ def stop_event(lifeline: bool) -> threading.Event:
 
     Call it in the main thread.
     """
-    told = threading.Event()
+    stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: told.set())
+        signal.signal(number, lambda *_: stop.set())
     if lifeline:
-        threading.Thread(target=_watch, args=(told,), name="lifeline", daemon=True).start()
-    return told
+        threading.Thread(target=_watch, args=(stop,), name="lifeline", daemon=True).start()
+    return stop
 
 
-def _watch(told: threading.Event) -> None:
+def _watch(stop: threading.Event) -> None:
     while os.read(0, 4096):
         pass
-    told.set()
+    stop.set()

@@ -150,13 +150,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     import robots
 
     options = parser().parse_args(arguments)
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
         node = Ros1Node(robots.load_robot(options.robot, options.groups), options, clock)
         with ros1_modules.lent(options.python), contextlib.closing(node):
             program.announce_ready(node.open(), options.ready_file)
-            run(node, clock, options.rate, told)
+            run(node, clock, options.rate, stop)
             print(json.dumps({"truth": node.truth(), "refused": node.refused}), flush=True)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)

@@ -148,13 +148,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     import robots
 
     options = parser().parse_args(arguments)
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
         node = Ros2Node(robots.load_robot(options.robot, options.groups), options, clock)
         with contextlib.closing(node):
             program.announce_ready(node.open(), options.ready_file)
-            run(node, clock, options.rate, told)
+            run(node, clock, options.rate, stop)
             print(json.dumps({"truth": node.truth(), "refused": node.refused}), flush=True)
     except ImportError as error:
         print(f'{error}: install it: pip install "eva-web[ros2]"', file=sys.stderr)

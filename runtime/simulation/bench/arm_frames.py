@@ -92,8 +92,10 @@ def _chain_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
     driven = [name for name in dict.fromkeys(leaders) if name in movers]
     if not driven:
         return None, []
-    known = {name: value for group in members if group.chain for name, value in group.chain.pinned.items()}
-    pinned = {name: known.get(name, 0.0) for name in leaders if name not in movers}
+    pinned_values = {
+        name: value for group in members if group.chain for name, value in group.chain.pinned.items()
+    }
+    pinned = {name: pinned_values.get(name, 0.0) for name in leaders if name not in movers}
     return Chain(tree, tree.root, arm.frame, driven, pinned), [movers[name] for name in driven]
 
 

@@ -118,10 +118,10 @@ class PinholeCamera:
             BenchError: If the ray never reaches that height.
         """
         ray = self.pose[:3, :3] @ [(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0]
-        way = (z - self.pose[2, 3]) / ray[2] if abs(ray[2]) > 1e-9 else -1.0
-        if way <= 0:
+        ray_length = (z - self.pose[2, 3]) / ray[2] if abs(ray[2]) > 1e-9 else -1.0
+        if ray_length <= 0:
             raise BenchError(f"pixel ({u}, {v}) shows nothing at height {z} m")
-        x, y, _ = self.pose[:3, 3] + way * ray
+        x, y, _ = self.pose[:3, 3] + ray_length * ray
         return float(x), float(y)
 
 

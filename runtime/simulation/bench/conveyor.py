@@ -147,8 +147,8 @@ class Conveyor(Tabletop):
         """Advance the belt by `seconds`, and with it a block that lies on it."""
         before, self._elapsed = self._elapsed, min(self._elapsed + seconds, self._course.duration)
         block = self._blocks[0]
-        aside = abs(block.pose[1, 3] - self.belt.y)
-        if not block.held_by and aside < self.belt.width / 2 and block.bottom < _ON_BELT:
+        offset = abs(block.pose[1, 3] - self.belt.y)
+        if not block.held_by and offset < self.belt.width / 2 and block.bottom < _ON_BELT:
             block.shift(np.array([self._course.x(self._elapsed) - self._course.x(before), 0.0]))
 
     def _note(self) -> None:

@@ -46,13 +46,13 @@ def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
 
 def push(hand: Hand, block: Block, seconds: float) -> None:
     """Move a block out of the finger that is deepest in it, at most at the hand's speed plus _YIELD."""
-    deepest, way = 0.0, np.zeros(2)
+    deepest, towards = 0.0, np.zeros(2)
     for ball in hand.balls():
         if block.bottom - FINGER_RADIUS < ball[2] < block.top + FINGER_RADIUS:
             depth, direction = _overlap(block, ball[:2])
             if depth > deepest:
-                deepest, way = depth, direction
-    block.shift(way * min(deepest, (hand.speed + _YIELD) * seconds))
+                deepest, towards = depth, direction
+    block.shift(towards * min(deepest, (hand.speed + _YIELD) * seconds))
 
 
 def _between(hand: Hand, block: Block, place: Float64) -> bool:

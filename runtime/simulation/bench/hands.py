@@ -61,9 +61,9 @@ class Jaws:
     def hand(self, q: Float64, before: Hand | None, seconds: float) -> Hand:
         """Return the fingers at joints q [D]; `before` is their state `seconds` ago, None at the first step."""
         tip = self._limb.tip(q)
-        way = 0.0 if before is None else float(np.linalg.norm(tip[:2, 3] - before.tip[:2, 3]))
+        travel = 0.0 if before is None else float(np.linalg.norm(tip[:2, 3] - before.tip[:2, 3]))
         opening = max(0.0, self._opening.metres(float(q[self._dim])))
-        return Hand(self.name, tip, opening, way / seconds if seconds > 0 else 0.0)
+        return Hand(self.name, tip, opening, travel / seconds if seconds > 0 else 0.0)
 
     def stop(self, q: Float64, opening: float) -> None:
         """Set the gripper's value in q [D] so that the jaws are `opening` [m] apart."""

@@ -57,21 +57,21 @@ def _parse_positions(positions: Mapping[str, Any]) -> tuple[list[float] | None, 
     return block, plate
 
 
-def _place(name: str, given: Any, count: int) -> list[float] | None:
-    if given is None:
+def _place(name: str, value: Any, count: int) -> list[float] | None:
+    if value is None:
         return None
-    numbers = list(given) if isinstance(given, list | tuple) else []
+    numbers = list(value) if isinstance(value, list | tuple) else []
     right = len(numbers) == count and all(
         isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
         for number in numbers
     )
     if not right:
-        raise BenchError(f"positions.{name} = {given!r}; allowed: {count} finite numbers")
+        raise BenchError(f"positions.{name} = {value!r}; allowed: {count} finite numbers")
     x_from, x_to, y_from, y_to = Bench().area
     x, y = numbers[:2]
     if not (x_from <= x <= x_to and y_from <= y <= y_to):
         raise BenchError(
-            f"positions.{name} = {given!r}; allowed: x {x_from} to {x_to} m, y {y_from} to {y_to} m"
+            f"positions.{name} = {value!r}; allowed: x {x_from} to {x_to} m, y {y_from} to {y_to} m"
         )
     return [float(number) for number in numbers]
 
@@ -83,9 +83,9 @@ def _pair(
     for _ in range(_TRIES):
         block_x, block_y, yaw = _random_place(chance) if block is None else _random_near(chance, block)
         plate_x, plate_y, _ = _random_place(chance) if plate is None else _random_near(chance, [*plate, 0.0])
-        asked = block is not None and plate is not None
+        requested = block is not None and plate is not None
         apart = math.dist((block_x, block_y), (plate_x, plate_y)) >= APART_M
-        if asked or (apart and _one_side((block_x, block_y), (plate_x, plate_y))):
+        if requested or (apart and _one_side((block_x, block_y), (plate_x, plate_y))):
             return (block_x, block_y, yaw), (plate_x, plate_y)
     raise BenchError(f"no place was found beside block {block}, plate {plate}; allowed: other positions")
 
@@ -111,7 +111,7 @@ def _distractor(
 ) -> tuple[float, float, float]:
     for _ in range(_TRIES):
         x, y, yaw = _random_place(chance)
-        clear = all(math.dist((x, y), other[:2]) >= _CROWD_M for other in placed)
+        clear = all(math.dist((x, y), taken_place[:2]) >= _CROWD_M for taken_place in placed)
         if clear and math.dist((x, y), plate) >= APART_M:
             return x, y, yaw
     raise BenchError(f"no place was found for block {len(placed) + 1}; allowed: fewer blocks")

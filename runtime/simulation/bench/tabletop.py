@@ -169,31 +169,31 @@ class Tabletop:
         centre = block.pose[:2, 3]
         on_plate = float(np.hypot(*(centre - self._plate))) < self.bench.plate_radius
         heights = [self.bench.plate_height if on_plate else 0.0]
-        for other in self._blocks:
-            under = other is not block and not other.held_by and block.bottom > other.pose[2, 3]
-            if under and np.abs(other.offset(centre)).max() < other.edge / 2:
-                heights.append(other.top)
+        for support in self._blocks:
+            under = support is not block and not support.held_by and block.bottom > support.pose[2, 3]
+            if under and np.abs(support.offset(centre)).max() < support.edge / 2:
+                heights.append(support.top)
         return max(heights)
 
-    def _separate(self, block: Block, other: Block, seconds: float) -> None:
+    def _separate(self, block: Block, neighbour: Block, seconds: float) -> None:
         """Slide a block away from another block that it overlaps, as far as it moves in `seconds`."""
-        if block.held_by or abs(block.pose[2, 3] - other.pose[2, 3]) > 0.9 * block.edge:
+        if block.held_by or abs(block.pose[2, 3] - neighbour.pose[2, 3]) > 0.9 * block.edge:
             return
-        way = block.pose[:2, 3] - other.pose[:2, 3]
-        distance = float(np.hypot(*way))
+        offset = block.pose[:2, 3] - neighbour.pose[:2, 3]
+        distance = float(np.hypot(*offset))
         depth = 1.1 * block.edge - distance
         if depth > 0:
-            direction = way / distance if distance > 1e-9 else np.array([1.0, 0.0])
+            direction = offset / distance if distance > 1e-9 else np.array([1.0, 0.0])
             block.shift(direction * min(depth, _APART_SPEED * seconds))
 
     def _clear_rim(self, block: Block, seconds: float) -> None:
         """Slide a block that touches the plate from the side away from it, as far as it moves in `seconds`."""
         if block.bottom > self.bench.plate_height - _RIM:
             return
-        way = block.pose[:2, 3] - self._plate
+        offset = block.pose[:2, 3] - self._plate
         depth = self.bench.plate_radius - float(np.hypot(*(block.nearest(self._plate) - self._plate)))
         if depth > 0:
-            block.shift(way / max(float(np.hypot(*way)), 1e-9) * min(depth, _APART_SPEED * seconds))
+            block.shift(offset / max(float(np.hypot(*offset)), 1e-9) * min(depth, _APART_SPEED * seconds))
 
     def _note(self) -> None:
         """Update the milestones of the task's block."""

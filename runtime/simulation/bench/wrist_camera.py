@@ -49,9 +49,11 @@ def place_wrist_camera(robot: Robot, arm: str) -> CameraPlacement:
     tip = arm_frames(robot)[arm].tip(q)
     boxes = _Boxes(scene_of(robot), q)
     best, most = CameraPlacement(), -1.0
-    for aside, ahead in _BESIDE:
+    for sideways, ahead in _BESIDE:
         for side in (-1.0, 1.0):
-            eye = CameraPlacement((side * aside, 0.0, ahead), (side * 0.005, 0.0, _AHEAD), (side, 0.0, 0.0))
+            eye = CameraPlacement(
+                (side * sideways, 0.0, ahead), (side * 0.005, 0.0, _AHEAD), (side, 0.0, 0.0)
+            )
             share = boxes.visible_share(_placed(tip, np.array(eye.place)), _placed(tip, _SEEN))
             if share >= _ENOUGH:
                 return eye
@@ -76,10 +78,13 @@ class _Boxes:
         if ((start >= self._low) & (start <= self._high)).all(axis=1).any():
             return 0.0
         # Slab test: where each ray enters and leaves each box, as shares of its length.
-        way = np.einsum("sij,nj->nsi", self._back[:, :3, :3], points - eye)
-        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
-        one, other = (self._low - start) / way, (self._high - start) / way
-        enters, leaves = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+        rays = np.einsum("sij,nj->nsi", self._back[:, :3, :3], points - eye)
+        rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+        low_crossing, high_crossing = (self._low - start) / rays, (self._high - start) / rays
+        enters, leaves = (
+            np.minimum(low_crossing, high_crossing).max(axis=-1),
+            np.maximum(low_crossing, high_crossing).min(axis=-1),
+        )
         hidden = (enters <= leaves) & (leaves > 0) & (enters < _SHORT)
         return float(1.0 - hidden.any(axis=1).mean())
 

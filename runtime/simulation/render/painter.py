@@ -69,9 +69,9 @@ class Painter:
         outside.
         """
         solids, normals = self._solids, self._placed.normals
-        wanted = np.zeros(len(solids.solids), bool)
-        wanted[chosen] = True
-        faces = np.flatnonzero(wanted[solids.face_solids])
+        is_chosen = np.zeros(len(solids.solids), bool)
+        is_chosen[chosen] = True
+        faces = np.flatnonzero(is_chosen[solids.face_solids])
         ray = eye - self._corners[faces]
         outside = np.einsum("fd,fd->f", ray, normals[faces]) > 0
         faces, ray = faces[outside], ray[outside]
@@ -134,17 +134,17 @@ def fill_ahead(
 
 def ahead(inside: Float32) -> Float32:
     """Return the part [m, 3] of a flat polygon [n, 3] in camera axes that is in front of the camera, or [0, 3]."""
-    kept: list[list[float]] = []
+    clipped: list[list[float]] = []
     corners: list[list[float]] = inside.tolist()
     before = corners[-1]
     for corner in corners:
         if (corner[2] >= _NEAR) != (before[2] >= _NEAR):
-            way = (_NEAR - before[2]) / (corner[2] - before[2])
-            kept.append([a + (b - a) * way for a, b in zip(before, corner, strict=True)])
+            share = (_NEAR - before[2]) / (corner[2] - before[2])
+            clipped.append([a + (b - a) * share for a, b in zip(before, corner, strict=True)])
         if corner[2] >= _NEAR:
-            kept.append(corner)
+            clipped.append(corner)
         before = corner
-    return np.array(kept, np.float32).reshape(-1, 3)
+    return np.array(clipped, np.float32).reshape(-1, 3)
 
 
 def _in_view(camera: PinholeCamera, inside: Float32, solids: Solids) -> NDArray[np.bool_]:

@@ -73,7 +73,7 @@ class Renderer:
         if blocks not in self._solids:
             shapes = [
                 Solid(visual.part, visual.kind, visual.size, visual.origin, visual.colour[:3])
-                for visual in (shown.simple() for shown in self._scene.visuals)
+                for visual in (scene_visual.simple() for scene_visual in self._scene.visuals)
             ]
             self._solids[blocks] = Solids([*shapes, *(self._block(index) for index in range(blocks))])
         return self._solids[blocks]

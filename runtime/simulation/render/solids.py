@@ -90,8 +90,8 @@ class Solids:
         vertices = (turns[self._vertex_frames] @ self._vertices)[..., 0] + shifts[self._vertex_frames]
         normals = (turns[self._face_frames] @ self._normals)[..., 0]
         boxes = near[self.frames] @ self._origins
-        seen = np.ones(len(self.solids), bool)
-        return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1), seen)
+        visible = np.ones(len(self.solids), bool)
+        return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1), visible)
 
     def above_table(self, placed: Placed) -> Placed:
         """Return the solids with everything below the table, z = 0, cut off; those entirely below it are not drawn."""

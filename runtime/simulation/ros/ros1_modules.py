@@ -35,16 +35,16 @@ def lent(python: str) -> Iterator[None]:
     Raises:
         SetupError: If that installation lacks a needed package, or cannot be run.
     """
-    wanted = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
-    found = _places(python, wanted)
-    missing = _NEEDED & set(wanted) - found.keys()
+    needed = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    origins = _places(python, needed)
+    missing = _NEEDED & set(needed) - origins.keys()
     if missing:
         raise SetupError(
             f"{python} lacks {', '.join(sorted(missing))}; install them: apt-get install python3-rospy "
             "python3-sensor-msgs, or name another one with --python"
         )
     with tempfile.TemporaryDirectory() as folder:
-        for origin in found.values():
+        for origin in origins.values():
             place = Path(origin).parent if Path(origin).name == "__init__.py" else Path(origin)
             (Path(folder) / place.name).symlink_to(place)
         sys.path.append(folder)
@@ -56,10 +56,10 @@ def lent(python: str) -> Iterator[None]:
 
 def _places(python: str, names: Iterable[str]) -> dict[str, str]:
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             [python, "-c", _FIND, *names], capture_output=True, text=True, timeout=20, check=True
         )
     except (OSError, subprocess.SubprocessError) as error:
         raise SetupError(f"{python} cannot be asked for its rospy: {error}") from error
-    found: dict[str, str] = json.loads(done.stdout)
-    return found
+    origins: dict[str, str] = json.loads(completed.stdout)
+    return origins

@@ -24,9 +24,9 @@ def free_domain() -> Iterator[int]:
     for offset in _DOMAINS:
         domain = _DOMAINS[(start * 7 + offset) % len(_DOMAINS)]
         first = _FIRST + _EACH * domain
-        with contextlib.ExitStack() as held:
+        with contextlib.ExitStack() as stack:
             try:
-                mark = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+                mark = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
                 mark.bind(("127.0.0.1", first + _EACH - 1))
                 for port in (first + 10, first + 11, first + 12, first + 13):
                     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

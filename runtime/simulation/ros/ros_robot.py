@@ -69,9 +69,9 @@ class RosRobot(ABC):
         self._plant = Plant(robot, start=start_pose(robot, options.start_pose))
         self._surroundings = environments.make_environment(robot, options)
         self._pictures, self._groups = topics(robot, options.topics_of or self.VERSION)
-        known = [*self._pictures.values(), *(group.state for group in self._groups.values())]
-        if options.silence is not None and options.silence not in known:
-            raise SetupError(f"--silence {options.silence} is no topic of {robot.name}; it has {known}")
+        allowed = [*self._pictures.values(), *(group.state for group in self._groups.values())]
+        if options.silence is not None and options.silence not in allowed:
+            raise SetupError(f"--silence {options.silence} is no topic of {robot.name}; it has {allowed}")
         self._heard = -math.inf
         self._holding = True
         self._sequence = 0

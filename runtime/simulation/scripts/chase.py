@@ -101,9 +101,11 @@ class ChaseEpisode:
         """Return extrapolated positions of the block along the belt at `times` [n], and its newest position across it
         [n].
         """
-        seen = np.array(self._seen)
-        newest = seen[-1]
-        fitted = seen[(newest[0] - seen[:, 0] <= _WINDOW) | (np.arange(len(seen)) >= len(seen) - 2)]
+        samples = np.array(self._seen)
+        newest = samples[-1]
+        fitted = samples[
+            (newest[0] - samples[:, 0] <= _WINDOW) | (np.arange(len(samples)) >= len(samples) - 2)
+        ]
         since = fitted[:, 0] - fitted[:, 0].mean()
         spread = float(since @ since)
         velocity = float(since @ fitted[:, 1]) / spread if spread > 0 else 0.0
@@ -144,16 +146,16 @@ class PlaceMap:
 
     def _solved(self, robot: Robot, postures: Postures, arm: Group) -> Float64 | None:
         """Return joints [along, across, D] of an arm on the grid; None if it does not reach all places."""
-        rest = robot.poses.get("ready", robot.poses["home"])
+        rest_joints = robot.poses.get("ready", robot.poses["home"])
         dx, dy, height = self.belt.fingertip_offset
-        found = []
+        solutions = []
         for x in self._x:
             for y in self._y:
-                joints = postures.hover(arm, rest, (float(x + dx), float(y + dy)), height)
+                joints = postures.hover(arm, rest_joints, (float(x + dx), float(y + dy)), height)
                 if joints is None:
                     return None
-                found.append(joints)
-        return np.array(found).reshape(*_NODES, robot.dim)
+                solutions.append(joints)
+        return np.array(solutions).reshape(*_NODES, robot.dim)
 
 
 def _between(nodes: Float64, values: Float64) -> tuple[np.ndarray, Float64]:

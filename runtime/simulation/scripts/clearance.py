@@ -33,8 +33,8 @@ class Clearance:
         self._links = np.array(
             [index for index, pair in enumerate(pairs) if TABLE not in pair], dtype=np.intp
         )
-        wanted = np.array([_BETWEEN if len(owner) > 1 else _OWN for owner in owners])
-        self._wanted = wanted[self._links]
+        required = np.array([_BETWEEN if len(owner) > 1 else _OWN for owner in owners])
+        self._wanted = required[self._links]
 
     def margin_along(self, rows: Float64) -> float:
         """Return the smallest difference between clearance and required clearance along a path float64 [n, D] [m].

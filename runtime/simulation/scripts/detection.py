@@ -69,29 +69,29 @@ class OverheadDetector:
         Raises:
             BenchError: If the image has another shape.
         """
-        shown = _without_bars(_channels_last(picture))
-        if int(shown.max(initial=0)) < _DARKEST:
+        image = _without_bars(_channels_last(picture))
+        if int(image.max(initial=0)) < _DARKEST:
             return Detection(dark=True)
-        hsv = cv2.cvtColor(np.ascontiguousarray(shown), cv2.COLOR_RGB2HSV)
-        return Detection(self._block(shown, hsv), self._plate(hsv))
+        hsv = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2HSV)
+        return Detection(self._block(image, hsv), self._plate(hsv))
 
-    def _block(self, shown: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
+    def _block(self, image: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
         """Return the block's pose from its silhouette: its middle is at half the block's height, its smallest box has
         its yaw.
         """
         colour = self._bench.block_colours[0]
-        found = _largest(_mask(hsv, colour))
-        if found is None:
+        contour = _largest(_mask(hsv, colour))
+        if contour is None:
             return None
-        left, top, width, height = cv2.boundingRect(found)
+        left, top, width, height = cv2.boundingRect(contour)
         rows = slice(max(0, top - 2), top + height + 2)
         columns = slice(max(0, left - 2), left + width + 2)
-        crop = cv2.resize(shown[rows, columns], None, fx=_FINER, fy=_FINER, interpolation=cv2.INTER_LINEAR)
+        crop = cv2.resize(image[rows, columns], None, fx=_FINER, fy=_FINER, interpolation=cv2.INTER_LINEAR)
         outline = _largest(_mask(cv2.cvtColor(crop, cv2.COLOR_RGB2HSV), colour))
         if outline is None:
             return None
         fine = outline[:, 0].astype(np.float64)
-        pixels = self._native((fine + 0.5) / _FINER - 0.5 + (columns.start, rows.start), shown)
+        pixels = self._native((fine + 0.5) / _FINER - 0.5 + (columns.start, rows.start), image)
         hull = cv2.convexHull(pixels.astype(np.float32))
         (u, v), sides, angle = cv2.minAreaRect(hull)
         edge = self._bench.block_edge
@@ -134,9 +134,9 @@ class OverheadDetector:
         is_round = max(width, height) <= _ROUND * min(width, height) and _is_ring(mask, rim)
         return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _PLATE_SIZE) else None
 
-    def _native(self, pixels: Float64, shown: Matrix) -> Float64:
-        """Convert pixels [n, 2] of the image `shown` to pixels of the camera."""
-        height, width = shown.shape[:2]
+    def _native(self, pixels: Float64, image: Matrix) -> Float64:
+        """Convert pixels [n, 2] of `image` to pixels of the camera."""
+        height, width = image.shape[:2]
         return np.asarray((pixels + 0.5) * (_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height) - 0.5)
 
 
@@ -192,5 +192,5 @@ def _area(camera: PinholeCamera, points: Float64) -> float:
     return float(cv2.contourArea(cv2.convexHull(camera.project(points).astype(np.float32))))
 
 
-def _within(seen: float, expected: float, share: tuple[float, float]) -> bool:
-    return share[0] * expected <= seen <= share[1] * expected
+def _within(measured: float, expected: float, share: tuple[float, float]) -> bool:
+    return share[0] * expected <= measured <= share[1] * expected

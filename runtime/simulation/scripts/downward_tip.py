@@ -43,12 +43,12 @@ class DownwardTip:
     def interpolate(self, other: DownwardTip) -> Iterator[DownwardTip]:
         """Yield the poses on the path to the pose `other`, without both ends."""
         numbers = np.array([*self.place, self.height, self.yaw, self.bearing, self.tilt])
-        way = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
-        way[3:5] = [math.remainder(turn, 2 * math.pi) for turn in way[3:5]]
+        change = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
+        change[3:5] = [math.remainder(turn, 2 * math.pi) for turn in change[3:5]]
         count = max(
-            math.ceil(float(np.linalg.norm(way[:3])) / _STRIDE),
-            math.ceil(float(np.abs(way[3:]).max()) / _SWING),
+            math.ceil(float(np.linalg.norm(change[:3])) / _STRIDE),
+            math.ceil(float(np.abs(change[3:]).max()) / _SWING),
         )
         for step in range(1, count):
-            x, y, *rest = (numbers + way * step / count).tolist()
-            yield DownwardTip((x, y), *rest)
+            x, y, *orientation = (numbers + change * step / count).tolist()
+            yield DownwardTip((x, y), *orientation)

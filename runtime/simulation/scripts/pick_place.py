@@ -143,19 +143,19 @@ class PickPlaceEpisode:
 
     def __call__(self, q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
         """Return rows float32 [H, D]: the next rows of the route, or the joints `q` if there is nothing to do."""
-        sight = self._detect(pictures)
+        detection = self._detect(pictures)
         now = self._policy.clock.now()
         elapsed, self._asked = now - self._asked, now
-        if prompt != self._prompt or self._is_over(elapsed) or self._elsewhere(q, sight):
+        if prompt != self._prompt or self._is_over(elapsed) or self._elsewhere(q, detection):
             self._forget()
         self._prompt = prompt
-        if sight.dark:
+        if detection.dark:
             return self._still(q)
         self._advance(q, elapsed)
         if self._misses(q):
             self._follow_route(self._policy.planner.retreat(q, self._on().arm))
         if self._route is None:
-            self._decide(q, sight)
+            self._decide(q, detection)
         return self._still(q) if self._route is None else self._ahead(self._route)
 
     def _detect(self, pictures: Mapping[str, UInt8]) -> Detection:
@@ -166,24 +166,24 @@ class PickPlaceEpisode:
 
     # --- deciding ------------------------------------------------------------------------------------------
 
-    def _decide(self, q: Float64, sight: Detection) -> None:
+    def _decide(self, q: Float64, detection: Detection) -> None:
         """Plan a route if block and plate are detected and the block is not on the plate yet."""
-        if sight.block is None or sight.plate is None:
+        if detection.block is None or detection.plate is None:
             return
-        if math.dist(sight.block[:2], sight.plate) < self._policy.table.plate_radius - _MARGIN:
+        if math.dist(detection.block[:2], detection.plate) < self._policy.table.plate_radius - _MARGIN:
             self._forget()
             return
         if self._resigned:
-            self._left = self._left or sight
-            if not _differs(sight, self._left):
+            self._left = self._left or detection
+            if not _differs(detection, self._left):
                 return
             self._forget()
         if self._luck is None:
             self._luck = self._policy.next_episode_noise()
-        block = self._luck.perceive(sight.block)
-        route = self._policy.planner.pick_and_place(q, block, sight.plate, self._luck.slip)
+        block = self._luck.perceive(detection.block)
+        route = self._policy.planner.pick_and_place(q, block, detection.plate, self._luck.slip)
         if route is not None:
-            self._seen = sight
+            self._seen = detection
             self._follow_route(route)
 
     def _follow_route(self, route: Route | None) -> None:
@@ -202,12 +202,12 @@ class PickPlaceEpisode:
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED
 
-    def _elsewhere(self, q: Float64, sight: Detection) -> bool:
+    def _elsewhere(self, q: Float64, detection: Detection) -> bool:
         """Return True if the robot is far from its route, or objects were moved before they were grasped."""
         if self._route is None:
             return False
         return self._distances(q).min() > _LOST or (
-            self._route.legs[self._leg].name in _COMING and _differs(sight, self._seen)
+            self._route.legs[self._leg].name in _COMING and _differs(detection, self._seen)
         )
 
     # --- following -----------------------------------------------------------------------------------------
@@ -247,10 +247,10 @@ class PickPlaceEpisode:
         leg, start = route.legs[self._leg], route.starts[self._leg]
         jaw = gripper_dim(route.arm)
         away = np.abs(leg.rows[:, jaw] - q[jaw]) if leg.gate else self._distances(q)
-        seen = start + int(away.argmin())
+        nearest = start + int(away.argmin())
         near = self._apart(route.rows[[min(round(row), len(route.rows) - 1)]], q)[0] <= _FAR
-        if not (near and seen - _BEHIND * rate <= row <= seen + _AHEAD * rate):
-            row = seen + _LEAD * rate
+        if not (near and nearest - _BEHIND * rate <= row <= nearest + _AHEAD * rate):
+            row = nearest + _LEAD * rate
         return min(row, start + len(leg.rows) - 1.0) if leg.gate else row
 
     def _passed(self, q: Float64) -> bool:
@@ -275,8 +275,8 @@ class PickPlaceEpisode:
 
     def _ahead(self, route: Route) -> Float32:
         """Return the next rows of the route; after its end, the last row is repeated."""
-        wanted = round(self._row) + np.arange(self._policy.horizon)
-        return route.rows[np.minimum(wanted, len(route.rows) - 1)].astype(np.float32)
+        places = round(self._row) + np.arange(self._policy.horizon)
+        return route.rows[np.minimum(places, len(route.rows) - 1)].astype(np.float32)
 
     def _still(self, q: Float64) -> Float32:
         return np.repeat(q[None], self._policy.horizon, axis=0).astype(np.float32)
@@ -297,13 +297,13 @@ def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
 
     Different joints with the same pose have distance 0. A shift of _ARM metres counts as one radian.
     """
-    wanted, found = arm.pose(rows), arm.pose(q)
-    shift = np.linalg.norm(wanted[:, :3] - found[:3], axis=1) / _ARM
-    turn = 2 * np.arccos(np.minimum(1.0, np.abs(wanted[:, 3:] @ found[3:])))
+    planned, current = arm.pose(rows), arm.pose(q)
+    shift = np.linalg.norm(planned[:, :3] - current[:3], axis=1) / _ARM
+    turn = 2 * np.arccos(np.minimum(1.0, np.abs(planned[:, 3:] @ current[3:])))
     return np.asarray(np.maximum(shift, turn))
 
 
-def _differs(sight: Detection, before: Detection) -> bool:
+def _differs(detection: Detection, before: Detection) -> bool:
     """Return True if the block or the plate was detected at another place in `before`."""
-    pairs = ((sight.block, before.block), (sight.plate, before.plate))
+    pairs = ((detection.block, before.block), (detection.plate, before.plate))
     return any(now and then and math.dist(now[:2], then[:2]) > _MOVED for now, then in pairs)

@@ -66,14 +66,14 @@ def pose_format(assignments: Sequence[str]) -> PoseFormat:
     Raises:
         SetupError: If an assignment is invalid; the message names it.
     """
-    given = {}
+    fields = {}
     for text in assignments:
         key, equals, value = text.partition("=")
         if not equals:
             raise SetupError(f"--pose {text}; allowed: KEY=VALUE with {', '.join(PoseFormat.model_fields)}")
-        given[key.strip()] = _value(value)
+        fields[key.strip()] = _value(value)
     try:
-        return PoseFormat.model_validate(given)
+        return PoseFormat.model_validate(fields)
     except (ValidationError, RuntimeFault) as error:
         raise SetupError(f"--pose {' '.join(assignments)}: {error}") from None
 

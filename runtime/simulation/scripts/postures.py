@@ -79,8 +79,8 @@ class Postures:
     def hover(self, arm: Group, q: Float64, place: Place, height: float) -> Float64 | None:
         """Return joints [D] with an arm's fingertips above `place` at `height`, jaws open; None if it cannot reach."""
         tilt = TILTS[0][1]
-        way = self._down(arm, q, place, 0.0, (height, CLEAR), (tilt, tilt))
-        return None if way is None else np.asarray(way[-1])
+        joint_path = self._down(arm, q, place, 0.0, (height, CLEAR), (tilt, tilt))
+        return None if joint_path is None else np.asarray(joint_path[-1])
 
     def stations(
         self,
@@ -123,16 +123,16 @@ class Postures:
         place = float(tip[0, 3]), float(tip[1, 3])
         yaw, bearing = math.atan2(tip[1, 1], tip[0, 1]), self._bearing(arm, place)
         for _, tilt in TILTS:
-            found = self._solved(arm, [DownwardTip(place, CLEAR, yaw, bearing, tilt)], q)
-            if found is not None:
-                return np.asarray(found[0])
+            solution = self._solved(arm, [DownwardTip(place, CLEAR, yaw, bearing, tilt)], q)
+            if solution is not None:
+                return np.asarray(solution[0])
         return q
 
     def stowed(self, arm: Group, q: Float64) -> Float64:
         """Return joints [D] with an arm in its rest posture and its jaws as in `q`."""
-        rest = q.copy()
-        rest[arm.joint_dims] = self._rest[arm.joint_dims]
-        return rest
+        stowed = q.copy()
+        stowed[arm.joint_dims] = self._rest[arm.joint_dims]
+        return stowed
 
     def rested(self, arm: Group, q: Float64) -> Float64:
         """Return joints [D] with an arm in its rest posture and its jaws open."""
@@ -152,8 +152,8 @@ class Postures:
         """
         bearing = self._bearing(arm, place)
         yaw = bearing + self._nominal[arm.name].across + twist
-        way = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
-        stations = [DownwardTip(place, height, yaw, bearing, tilt) for height, tilt in way.tolist()]
+        profile = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
+        stations = [DownwardTip(place, height, yaw, bearing, tilt) for height, tilt in profile.tolist()]
         return self._descent(arm, q, self._nominal[arm.name], stations)
 
     def _descent(
@@ -169,9 +169,9 @@ class Postures:
         if upright := self._limbs[arm.name].upright:
             turned = start.copy()
             turned[arm.joint_dims[0]] += upright * (stations[0].bearing - nominal.down.bearing)
-            found = self._solved(arm, stations, np.clip(turned, self._robot.lower, self._robot.upper))
-            if found is not None:
-                return found
+            solution = self._solved(arm, stations, np.clip(turned, self._robot.lower, self._robot.upper))
+            if solution is not None:
+                return solution
         return self._solved(arm, stations, start, list(nominal.down.interpolate(stations[0])))
 
     def _solved(
@@ -196,13 +196,13 @@ class Postures:
         """Find and store the nominal posture of an arm; return the reason if there is none, else ""."""
         if arm.tip is None or arm.gripper is None or arm.gripper.apart is None:
             return f"{arm.name} needs fingertips and a gripper that says how far it opens (apart)"
-        wanted = self._arm_places(arm)
+        places = self._arm_places(arm)
         best, reached = None, 0
         for nominal in self._search_postures(arm):
-            count = sum(self._reaches(arm, nominal, place) for place in wanted)
+            count = sum(self._reaches(arm, nominal, place) for place in places)
             if best is None or count > reached:
                 best, reached = nominal, count
-            if reached >= _ENOUGH * len(wanted):
+            if reached >= _ENOUGH * len(places):
                 break
         if best is None:
             return f"{arm.name} cannot hold its fingertips down {CLEAR} m above the table"
@@ -219,9 +219,9 @@ class Postures:
                 bearing = self._bearing(arm, place)
                 for across in (_ACROSS, -_ACROSS):
                     down = DownwardTip(place, CLEAR, bearing + across, bearing, TILTS[0][1])
-                    found = self._solved(arm, [down], seed)
-                    if found is not None:
-                        yield Nominal(found[0, arm.joint_dims], down, across)
+                    solution = self._solved(arm, [down], seed)
+                    if solution is not None:
+                        yield Nominal(solution[0, arm.joint_dims], down, across)
             share = min(1.0, 2 * (number + 1) / _TRIES)
             seed = np.clip(
                 (1 - share) * self._rest + share * chance.uniform(low, high),
@@ -247,7 +247,7 @@ class Postures:
             place
             for place in places
             if self.distance(arm, place)
-            <= min(self.distance(other, place) for other in self._robot.arms) + 1e-6
+            <= min(self.distance(any_arm, place) for any_arm in self._robot.arms) + 1e-6
         ]
 
     def _ahead(self, arm: Group) -> list[Place]:
@@ -287,7 +287,7 @@ def gripper_dim(arm: Group) -> int:
     return arm.gripper_dim
 
 
-def _with_jaws(arm: Group, q: Float64, here: float, there: float) -> Float64:
+def _with_jaws(arm: Group, q: Float64, start: float, end: float) -> Float64:
     changed = q.copy()
-    changed[..., gripper_dim(arm)] = here + _MARGIN * (there - here)
+    changed[..., gripper_dim(arm)] = start + _MARGIN * (end - start)
     return changed

@@ -110,14 +110,14 @@ class RoutePlanner:
         If the route comes too near to another arm or the body, another arm is tried, then routes for which other arms
         move out of the way. If none is clear, the route with the largest clearance is returned.
         """
-        found, most = None, -math.inf
+        best, most = None, -math.inf
         for route in self._routes(q, block, plate, slip):
             spare = self._room.margin_along(route.rows)
             if spare >= 0:
                 return route
             if spare > most:
-                found, most = route, spare
-        return found
+                best, most = route, spare
+        return best
 
     def _routes(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
@@ -137,21 +137,21 @@ class RoutePlanner:
 
     def _clear_other_arms(self, arm: Group, q: Float64) -> list[Leg]:
         """Return the legs that move all other arms to rest, first up from the table; [] if they are at rest already."""
-        others = tuple(
-            other
-            for other in self._robot.arms
-            if other is not arm and np.abs(self._postures.stowed(other, q) - q).max() > _AT_REST
+        others_away = tuple(
+            other_arm
+            for other_arm in self._robot.arms
+            if other_arm is not arm and np.abs(self._postures.stowed(other_arm, q) - q).max() > _AT_REST
         )
-        if not others:
+        if not others_away:
             return []
         high = q
-        for other in others:
-            high = self._postures.risen(other, high) if self._low(other, high) else high
-        rest = high
-        for other in others:
-            rest = self._postures.stowed(other, rest)
-        ways = [("rise", q, high)] * (high is not q) + [("make way", high, rest)]
-        return [replace(self._leg(*way), others=others) for way in ways]
+        for other_arm in others_away:
+            high = self._postures.risen(other_arm, high) if self._low(other_arm, high) else high
+        stowed = high
+        for other_arm in others_away:
+            stowed = self._postures.stowed(other_arm, stowed)
+        moves = [("rise", q, high)] * (high is not q) + [("make way", high, stowed)]
+        return [replace(self._leg(*move), others=others_away) for move in moves]
 
     def _low(self, arm: Group, q: Float64) -> bool:
         """Return True if the fingertips are so near to the table that they have to rise before any other motion."""
@@ -170,14 +170,14 @@ class RoutePlanner:
 
         Both have open jaws.
         """
-        held, lowered = (closed(arm, way) for way in (down, over))
+        gripped, lowered = (closed(arm, descent) for descent in (down, over))
         legs = []
         if self._low(arm, q):
             legs.append(self._leg("rise", q, self._postures.risen(arm, q)))
             q = legs[-1].end
         legs += [self._leg("reach", q, down[0]), self._vertical_leg("descend", down)]
-        legs += [self._jaw_leg("close", down[-1], held[-1]), self._vertical_leg("lift", held[::-1])]
-        carry = self._leg("carry", held[0], lowered[0])
+        legs += [self._jaw_leg("close", down[-1], gripped[-1]), self._vertical_leg("lift", gripped[::-1])]
+        carry = self._leg("carry", gripped[0], lowered[0])
         if slip.lets_go:
             half = carry.rows[: len(carry.rows) // 2]
             last = opened(arm, half[-1])
@@ -213,8 +213,8 @@ class RoutePlanner:
         """
         marks = np.linspace(0.0, 1.0, len(stations))
         powers = np.linalg.solve(np.vander(marks, increasing=True), stations)
-        way = np.abs(np.diff(stations, axis=0)).sum(axis=0)
-        seconds = max(_SHORTEST, shortest, _PEAK * float((way / self._speed).max()))
+        joint_travel = np.abs(np.diff(stations, axis=0)).sum(axis=0)
+        seconds = max(_SHORTEST, shortest, _PEAK * float((joint_travel / self._speed).max()))
         u = np.linspace(0.0, 1.0, 1 + math.ceil(seconds * self._rate))
         s = u**3 * (10 - 15 * u + 6 * u * u)
         rows = np.vander(s, len(stations), increasing=True) @ powers
