@@ -55,11 +55,13 @@ def _parser() -> argparse.ArgumentParser:
     out.add_argument(
         "--background", action="store_true", help="at the lowest priority; end when standard input ends"
     )
-    look = commands.add_parser("scrub", help="verify every file against its digest; exit code 1 tells damage")
-    look.add_argument(
+    scrub = commands.add_parser(
+        "scrub", help="verify every file against its digest; exit code 1 tells damage"
+    )
+    scrub.add_argument(
         "paths", type=Path, nargs="+", metavar="PATH", help="an episode, a folder of many, or the data folder"
     )
-    look.add_argument("--json", action="store_true", help="one object per episode and line")
+    scrub.add_argument("--json", action="store_true", help="one object per episode and line")
     return parser
 
 
@@ -105,8 +107,8 @@ def _repair(path: Path) -> int:
 
 def _line(report: RepairReport) -> str:
     figures = f"{report.frames} rows, {report.rows_cut} cut, {report.torn_bytes} torn bytes"
-    said = "; ".join(filter(None, (figures if report.verdict == "repaired" else "", report.problem)))
-    return f"{report.path}: {report.verdict}: {said or figures}"
+    details = "; ".join(filter(None, (figures if report.verdict == "repaired" else "", report.problem)))
+    return f"{report.path}: {report.verdict}: {details or figures}"
 
 
 def _show(path: Path) -> int:

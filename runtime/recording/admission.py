@@ -69,13 +69,13 @@ def admit_chunk(chunk: RawChunk) -> RawChunk:
             "must be [H, W] and [H]"
         )
     met: dict[str, Any] = {
-        name: None if (given := getattr(chunk, name)) is None else np.array(given)
+        name: None if (values := getattr(chunk, name)) is None else np.array(values)
         for name in ("ik_position_error", "ik_rotation_error", "ik_flags")
     }
-    for name, given in met.items():
-        if given is not None and (given.ndim != 2 or len(given) != len(actions)):
+    for name, values in met.items():
+        if values is not None and (values.ndim != 2 or len(values) != len(actions)):
             raise RecordingError(
-                f"chunk {chunk.chunk_id}: {name} {given.shape}, must be [{len(actions)}, arms]"
+                f"chunk {chunk.chunk_id}: {name} {values.shape}, must be [{len(actions)}, arms]"
             )
     return replace(chunk, actions=actions, target_steps=targets, **met)
 

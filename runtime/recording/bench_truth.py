@@ -16,8 +16,8 @@ _DECIMALS = 4  # 0.1 mm, so that objects at rest yield the same text in every ro
 
 def truth_text(truth: Mapping[str, Any]) -> str:
     """Return the recorded part of a bench's ground truth as JSON; "" if there is none."""
-    kept = {key: _rounded(truth[key]) for key in _KEPT if key in truth}
-    return json.dumps(kept, separators=(",", ":")) if kept else ""
+    fields = {key: _rounded(truth[key]) for key in _KEPT if key in truth}
+    return json.dumps(fields, separators=(",", ":")) if fields else ""
 
 
 def truth_changes(rows: Any) -> list[tuple[int, dict[str, Any]]]:
@@ -28,23 +28,23 @@ def truth_changes(rows: Any) -> list[tuple[int, dict[str, Any]]]:
     """
     if "bench" not in rows.column_names:
         return []
-    found = []
+    changes = []
     for row, text in enumerate(rows.column("bench").to_pylist()):
         if text is None:
             continue
         try:
-            said = json.loads(text)
+            truth = json.loads(text)
         except ValueError as error:
             raise RecordingError(f"rows.arrow: bench of row {row} is no JSON: {error}") from error
-        found.append((row, said if isinstance(said, dict) else {}))
-    return found
+        changes.append((row, truth if isinstance(truth, dict) else {}))
+    return changes
 
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, float):
         return round(value, _DECIMALS) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): _rounded(each) for key, each in value.items()}
+        return {str(key): _rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(each) for each in value]
+        return [_rounded(item) for item in value]
     return value

@@ -64,10 +64,10 @@ def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, An
 
 def spread(times: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the spread of the streams' capture times [S, N] in each row [s]; 0 if fewer than two are known."""
-    known = np.isfinite(times)
-    latest = np.where(known, times, -np.inf).max(axis=0, initial=-np.inf)
-    earliest = np.where(known, times, np.inf).min(axis=0, initial=np.inf)
-    apart: NDArray[np.float64] = np.where(known.sum(axis=0) >= 2, latest - earliest, 0.0)
+    finite = np.isfinite(times)
+    latest = np.where(finite, times, -np.inf).max(axis=0, initial=-np.inf)
+    earliest = np.where(finite, times, np.inf).min(axis=0, initial=np.inf)
+    apart: NDArray[np.float64] = np.where(finite.sum(axis=0) >= 2, latest - earliest, 0.0)
     return apart
 
 
@@ -151,8 +151,8 @@ def _vectors(values: Sequence[Float32 | None], width: int) -> Any:
 def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> list[list[Any] | None]:
     """Return one list of values per row of every chunk, None for the rows of chunks without values."""
     rows: list[list[Any] | None] = []
-    for each, length in zip(figures, lengths, strict=True):
-        rows += [None] * length if each is None else each.tolist()
+    for figure, length in zip(figures, lengths, strict=True):
+        rows += [None] * length if figure is None else figure.tolist()
     return rows
 
 

@@ -30,7 +30,7 @@ class DamageMark:
         """Return True if the same recording is intact again; not if it was sealed anew since."""
         if verdict.state == "sound":
             return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
-        files = {one["file"] for one in self.damage}
+        files = {entry["file"] for entry in self.damage}
         unsealed_then = bool(files) if self.seal == "" else self.seal is None and files == {OUTCOME}
         return verdict.state == "unsealed" and not verdict.why and unsealed_then
 
@@ -52,10 +52,10 @@ def read_mark(data: Path, uuid: str) -> DamageMark | None:
     if not path.exists():
         return None
     try:
-        told = read_json(path)
+        fields = read_json(path)
     except RecordingError:
-        told = {}
-    damage, seal = told.get("damage"), told.get("seal")
+        fields = {}
+    damage, seal = fields.get("damage"), fields.get("seal")
     if not (isinstance(damage, list) and all(map(_is_damage_table, damage))):
         return DamageMark([], "")
     return DamageMark(damage, seal if isinstance(seal, str) else None)
@@ -68,20 +68,20 @@ def known_damage(verdict: IntegrityCheck) -> tuple[Damage, ...]:
     if mark is None or mark.is_resolved_by(verdict):
         return ()
     spoiled = Damage(f"{FOLDER}/{verdict.path.name}.json", "is no mark any more, and was one")
-    return tuple(_damage(one) for one in mark.damage) or (spoiled,)
+    return tuple(_damage(entry) for entry in mark.damage) or (spoiled,)
 
 
-def _damage(told: Mapping[str, Any]) -> Damage:
-    spans = {name: tuple((first, last) for first, last in told[name]) for name in ("rows", "times")}
-    return Damage(told["file"], told["what"], **spans)
+def _damage(fields: Mapping[str, Any]) -> Damage:
+    spans = {name: tuple((first, last) for first, last in fields[name]) for name in ("rows", "times")}
+    return Damage(fields["file"], fields["what"], **spans)
 
 
-def _is_damage_table(one: object) -> bool:
+def _is_damage_table(value: object) -> bool:
     """Return True if the value has the form of one damage in `IntegrityCheck.to_dict`."""
-    if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
+    if not isinstance(value, dict) or value.keys() != {"file", "what", "rows", "times", "text"}:
         return False
-    words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
-    return words and _are_spans(one["rows"], int) and _are_spans(one["times"], float)
+    are_texts = all(isinstance(value[name], str) for name in ("file", "what", "text"))
+    return are_texts and _are_spans(value["rows"], int) and _are_spans(value["times"], float)
 
 
 def _are_spans(value: object, kind: type) -> bool:

@@ -116,12 +116,12 @@ class CameraEncoder:
         if self.failure is not None:
             self._refused = True
             return False
-        taken = self._queue.put(picture, patience, captured)
-        if not patience and not taken and (waiting := self._queue.waiting()) > self._most_behind:
+        accepted = self._queue.put(picture, patience, captured)
+        if not patience and not accepted and (waiting := self._queue.waiting()) > self._most_behind:
             self._give_up(
                 f"the encoder is {waiting} frames ({waiting / self._fps:.1f} s) behind and is given up"
             )
-        return taken
+        return accepted
 
     def finish(self) -> None:
         """Tell the thread to encode the waiting pictures and to end."""
@@ -155,9 +155,9 @@ class CameraEncoder:
         self._thread.join()
         self.file.close()
 
-    def _give_up(self, why: str) -> None:
+    def _give_up(self, reason: str) -> None:
         if self.failure is None:
-            self.failure = RecordingError(f"camera {self.camera}: {why}")
+            self.failure = RecordingError(f"camera {self.camera}: {reason}")
         self._queue.close(discard=True)
 
     def _run(self) -> None:

@@ -23,10 +23,10 @@ def require_encoder(settings: RecordingSettings) -> None:
     try:
         _code(name, settings.chosen_preset, settings.chosen_crf, settings.gop or 1)
     except (av.FFmpegError, ValueError) as error:
-        others = ", ".join(other for other in CODECS if other != name and is_encoder_usable(other))
-        why = getattr(error, "strerror", None) or str(error)
+        usable = ", ".join(codec for codec in CODECS if codec != name and is_encoder_usable(codec))
+        reason = getattr(error, "strerror", None) or str(error)
         raise ConfigurationError(
-            f"recording.codec = {name!r} does not work on this machine: {why}; allowed here: {others or 'none'}"
+            f"recording.codec = {name!r} does not work on this machine: {reason}; allowed here: {usable or 'none'}"
         ) from error
 
 

@@ -39,8 +39,8 @@ class Pace:
 
     def update(self, codings: int, seconds: float) -> None:
         """Record that coding `codings` frames took `seconds`, including waiting for a processor."""
-        each = seconds / codings
-        self.coding_s = max(each, self.coding_s + 0.2 * (each - self.coding_s))
+        mean_s = seconds / codings
+        self.coding_s = max(mean_s, self.coding_s + 0.2 * (mean_s - self.coding_s))
 
 
 class PictureQueue:
@@ -69,12 +69,12 @@ class PictureQueue:
             if picture is not None and self._has_room(patient=patience > 0.0):
                 self._entries.append(Picture(picture, captured))
                 self._held += 1
-                taken = True
+                accepted = True
             else:
                 self._repeat()
-                taken = False
+                accepted = False
             self._changed.notify_all()
-        return taken
+        return accepted
 
     def get(self) -> Picture | int | None:
         """Return the oldest entry, waiting for one; None when the queue is closed and empty."""

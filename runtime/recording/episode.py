@@ -103,8 +103,8 @@ class EpisodeJournal(Journal):
     def pop_lost_cameras(self) -> Sequence[LostCamera]:
         if self._recording is not None:
             self._losses += self._recording.pop_lost_cameras()
-        told, self._losses = self._losses, []
-        return told
+        losses, self._losses = self._losses, []
+        return losses
 
     def end(self, outcome: Outcome) -> None:
         """Write all waiting records, close every file, and write the outcome last.
@@ -212,7 +212,7 @@ class _Recording:
 
     def _append_row(self, row: Row) -> None:
         # The check comes first: a refused row must not leave a frame in the videos.
-        kept = admit_row(self._layout, row, self._rows)
+        admitted = admit_row(self._layout, row, self._rows)
         repeated = {
             camera
             for camera, encoder in self._encoders.items()
@@ -222,7 +222,7 @@ class _Recording:
         self._newest = row.tick_time
         unseen = {camera for camera in repeated if row.pictures[camera] is not None}
         lost = row.lost | unseen | self._lost.keys()
-        self._writer.add("rows", RecordedRow(kept, frozenset(repeated), frozenset(lost)), self._patience)
+        self._writer.add("rows", RecordedRow(admitted, frozenset(repeated), frozenset(lost)), self._patience)
 
     def _capture_time(self, row: Row, camera: str) -> float:
         """Return the capture time of the picture; NaN in lockstep, because encoders use another clock there."""
@@ -352,11 +352,11 @@ class _Recording:
             elif failure is not None and camera not in self._lost:
                 loss = self._lost[camera] = LostCamera(camera, encoder.frames, str(failure))
                 event = {"camera": camera, "row": loss.row}
-                told = {
+                fields = {
                     "kind": VIDEO_LOST,
                     "text": loss.text,
                     "time": self._newest,
                     "step": -1,
                     "data": event,
                 }
-                self._writer.add_line(to_json(told, "an event"))
+                self._writer.add_line(to_json(fields, "an event"))

@@ -125,14 +125,14 @@ def slug(text: object, empty: str = "unknown") -> str:
 
     A name that loses information or is too long gets a part of the text's hash, so that two texts never share a name.
     """
-    words = text if isinstance(text, str) else ""
-    if not words.strip():
+    title = text if isinstance(text, str) else ""
+    if not title.strip():
         return empty
-    kept = "".join(c if c.isalnum() else " " for c in unicodedata.normalize("NFKC", words))
-    name = "-".join(kept.split()).encode()[:_NAME_BYTES].decode(errors="ignore")
-    if name.replace("-", " ") == words and name != empty:
+    cleaned = "".join(c if c.isalnum() else " " for c in unicodedata.normalize("NFKC", title))
+    name = "-".join(cleaned.split()).encode()[:_NAME_BYTES].decode(errors="ignore")
+    if name.replace("-", " ") == title and name != empty:
         return name
-    mark = hashlib.sha256(words.encode(errors="surrogatepass")).hexdigest()[:8]
+    mark = hashlib.sha256(title.encode(errors="surrogatepass")).hexdigest()[:8]
     return f"{name}-{mark}" if name else mark
 
 
@@ -244,8 +244,8 @@ def _owners(run: _Run, steps: Any) -> Any:
 
 def _at_steps(ticks: Any, column: str, steps: Any) -> Any:
     """Return the values of `column` of the ticks at the given steps; null for a step without a tick."""
-    known, wanted = ticks["step"].to_numpy(), steps.to_numpy()
-    places = np.searchsorted(known, wanted)
-    found = places < len(known)
-    found[found] = known[places[found]] == wanted[found]
-    return ticks[column].take(pa.array(np.where(found, places, 0), mask=~found))
+    tick_steps, targets = ticks["step"].to_numpy(), steps.to_numpy()
+    places = np.searchsorted(tick_steps, targets)
+    present = places < len(tick_steps)
+    present[present] = tick_steps[places[present]] == targets[present]
+    return ticks[column].take(pa.array(np.where(present, places, 0), mask=~present))

@@ -102,14 +102,14 @@ def disk_error(doing: str, path: Path, error: OSError) -> RecordingError:
     It is a DiskFullError if the disk or quota is full.
     """
     full = _FULL.get(error.errno or 0)
-    what = full or _OTHERS.get(error.errno or 0, "disk error")
+    cause = full or _OTHERS.get(error.errno or 0, "disk error")
     reason = error.strerror or str(error)
     folder = _existing(path)
     try:
         room = f"{shutil.disk_usage(folder).free} bytes free in {folder}"
     except OSError as unknown:
         room = f"free space of {folder} unknown ({unknown.strerror})"
-    return (DiskFullError if full else RecordingError)(f"{what} while {doing} {path}: {reason}; {room}")
+    return (DiskFullError if full else RecordingError)(f"{cause} while {doing} {path}: {reason}; {room}")
 
 
 def require_room(folder: Path, wanted: int) -> None:

@@ -51,28 +51,28 @@ class IntegrityCheck:
     @property
     def text(self) -> str:
         """Sentence for the operator."""
-        said = {
+        texts = {
             "sound": f"every file is as {'repair left it' if self.repaired else 'it was recorded'}",
             "unsealed": self.why or UNSEALED,
             "open": self.why or "it has no outcome: it is being recorded, or wants repair",
-            "damaged": "; ".join(one.text for one in self.damage),
+            "damaged": "; ".join(damage.text for damage in self.damage),
         }
-        return said[self.state]
+        return texts[self.state]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON."""
         damage = [
             {
-                "file": one.file,
-                "what": one.description,
-                "rows": [list(span) for span in one.rows],
-                "times": [list(span) for span in one.times],
-                "text": one.text,
+                "file": entry.file,
+                "what": entry.description,
+                "rows": [list(span) for span in entry.rows],
+                "times": [list(span) for span in entry.times],
+                "text": entry.text,
             }
-            for one in self.damage
+            for entry in self.damage
         ]
-        told = {"episode": self.path.name, "state": self.state, "text": self.text}
-        return {**told, "bytes": self.bytes, "damage": damage}
+        fields = {"episode": self.path.name, "state": self.state, "text": self.text}
+        return {**fields, "bytes": self.bytes, "damage": damage}
 
 
 class DamagedError(RecordingError):

@@ -42,8 +42,8 @@ def read_labels(data: Path, episode: str) -> list[Label]:
 
 def latest_label(data: Path, episode: str) -> Label | None:
     """Return the newest label of an episode, which is the one that counts; None if it has no label."""
-    said = read_labels(data, episode)
-    return said[-1] if said else None
+    labels = read_labels(data, episode)
+    return labels[-1] if labels else None
 
 
 def append_label(data: Path, episode: str, label: Label) -> None:

@@ -62,8 +62,8 @@ class Layout:
         )
 
 
-def _wrong(key: str, given: object, allowed: str) -> RecordingError:
-    return RecordingError(f"manifest: {key} is {given!r}, must be {allowed}")
+def _wrong(key: str, value: object, allowed: str) -> RecordingError:
+    return RecordingError(f"manifest: {key} is {value!r}, must be {allowed}")
 
 
 def _require_key(table: Mapping[str, object], key: str, kind: type[_Kind]) -> _Kind:

@@ -41,11 +41,12 @@ def marked_damage(data: Path, uuid: str) -> list[dict[str, Any]]:
 def _mark(data: Path, verdict: IntegrityCheck) -> None:
     path, damage = mark_file(data, verdict.path.name), verdict.to_dict()["damage"]
     with exclusive(path.parent):
-        known = read_mark(data, verdict.path.name)
-        seal = (known.seal if known else None) or verdict.seal  # the first one: of the original recording
-        if known is None or (known.damage, known.seal) != (damage, seal):
-            told = {"uuid": verdict.path.name, "found": time.time(), "seal": seal, "damage": damage}
-            write_atomic(path, to_json(told, "the mark", indent=1))
+        previous = read_mark(data, verdict.path.name)
+        # The first seal: of the original recording.
+        seal = (previous.seal if previous else None) or verdict.seal
+        if previous is None or (previous.damage, previous.seal) != (damage, seal):
+            fields = {"uuid": verdict.path.name, "found": time.time(), "seal": seal, "damage": damage}
+            write_atomic(path, to_json(fields, "the mark", indent=1))
 
 
 def _remove_mark(data: Path, verdict: IntegrityCheck) -> None:

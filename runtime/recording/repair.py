@@ -105,37 +105,37 @@ def _attempt(folder: Path) -> RepairReport:
 def _judge(path: Path) -> RepairReport:
     try:
         layout = Layout.from_manifest(read_json(path / MANIFEST))
-        found = verify_episode(path)
-        if found.state != "open" or (path / OUTCOME_COPY).exists():
-            return _closed(path, found)
+        check = verify_episode(path)
+        if check.state != "open" or (path / OUTCOME_COPY).exists():
+            return _closed(path, check)
     except RecordingError as error:
         return RepairReport(path, "unreadable", str(error))
     return _complete(path, layout)
 
 
-def _closed(path: Path, found: IntegrityCheck) -> RepairReport:
+def _closed(path: Path, check: IntegrityCheck) -> RepairReport:
     """Restore outcome.json or its copy, if one is missing or damaged, from the intact file; change no other file.
 
     This is done only if all other files match their digests. Return the report.
     """
     restored = ""
-    if found.state in ("open", "damaged") and (whole := _whole_outcome(path, found)):
+    if check.state in ("open", "damaged") and (whole := _whole_outcome(path, check)):
         write_outcome(path, whole)
-        restored, found = found.text, verify_episode(path)
-    if found.state == "damaged":
-        return RepairReport(path, "damaged", found.text)
+        restored, check = check.text, verify_episode(path)
+    if check.state == "damaged":
+        return RepairReport(path, "damaged", check.text)
     (path / PLAN).unlink(missing_ok=True)
     frames = read_outcome(path).get("frames")
     verdict: Literal["restored", "complete"] = "restored" if restored else "complete"
     return RepairReport(path, verdict, restored, frames=frames if isinstance(frames, int) else 0)
 
 
-def _whole_outcome(path: Path, found: IntegrityCheck) -> bytes | None:
+def _whole_outcome(path: Path, check: IntegrityCheck) -> bytes | None:
     """Return the content of the only intact outcome file, outcome.json or its copy.
 
     None unless exactly one of them is intact and no other file is damaged.
     """
-    if {one.file for one in found.damage} - {OUTCOME, OUTCOME_COPY}:
+    if {damage.file for damage in check.damage} - {OUTCOME, OUTCOME_COPY}:
         return None
     whole = {}
     for name in (OUTCOME, OUTCOME_COPY):
@@ -148,16 +148,24 @@ def _whole_outcome(path: Path, found: IntegrityCheck) -> bytes | None:
 
 
 def _complete(path: Path, layout: Layout) -> RepairReport:
-    found = _load_or_measure(path, layout)
+    measured = _load_or_measure(path, layout)
     videos = _repair_videos(path, layout)
     lost = _repair_events(path)
     going = [frames for camera, frames in videos.items() if camera not in lost]
     frames = _repair_tables(path, layout, going)
-    cut = found.rows - frames
+    cut = measured.rows - frames
     report = RepairReport(
-        path, "repaired", found.unproven, frames, cut, videos, found.torn_bytes, found.torn_lines, lost
+        path,
+        "repaired",
+        measured.unproven,
+        frames,
+        cut,
+        videos,
+        measured.torn_bytes,
+        measured.torn_lines,
+        lost,
     )
-    write_outcome(path, seal_outcome(_outcome(report, layout, found.ended), digests_of(path, layout)))
+    write_outcome(path, seal_outcome(_outcome(report, layout, measured.ended), digests_of(path, layout)))
     (path / PLAN).unlink()  # last: a repair that is killed before continues from the stored state
     return report
 
@@ -181,9 +189,9 @@ def _load_or_measure(path: Path, layout: Layout) -> _FolderState:
             return _FolderState(**read_json(plan))  # type: ignore[arg-type]
         except TypeError as error:
             raise RecordingError(f"{plan} is none of repair's: {error}. Remove it") from error
-    found = _measured(path, layout)
-    write_atomic(plan, to_json(asdict(found), "the plan of a repair"))
-    return found
+    measured = _measured(path, layout)
+    write_atomic(plan, to_json(asdict(measured), "the plan of a repair"))
+    return measured
 
 
 def _measured(path: Path, layout: Layout) -> _FolderState:
@@ -254,9 +262,11 @@ def _repair_events(path: Path) -> dict[str, str]:
     events = read_events(log)
     if events.torn or not log.exists():
         write_atomic(log, b"".join(line + b"\n" for line in events.lines))
-    said = [json.loads(line) for line in events.lines]
+    recorded = [json.loads(line) for line in events.lines]
     return {
-        str(event["data"]["camera"]): str(event["text"]) for event in said if event.get("kind") == VIDEO_LOST
+        str(event["data"]["camera"]): str(event["text"])
+        for event in recorded
+        if event.get("kind") == VIDEO_LOST
     }
 
 
@@ -271,7 +281,8 @@ def _outcome(report: RepairReport, layout: Layout, ended: float) -> dict[str, ob
         "rows": report.frames,
         "video_frames": dict(report.video_frames),
         "lost_cameras": {
-            camera: {"row": report.video_frames[camera], "reason": why} for camera, why in report.lost.items()
+            camera: {"row": report.video_frames[camera], "reason": reason}
+            for camera, reason in report.lost.items()
         },
         "repair": {
             "rows_cut": report.rows_cut,

@@ -23,16 +23,16 @@ class Schema:
     @classmethod
     def from_manifest(cls, manifest: Mapping[str, Any]) -> Schema:
         """Read the schema from a manifest that media has not completed yet."""
-        said = manifest.get("collection")
-        if not said:
+        collection = manifest.get("collection")
+        if not collection:
             return cls()
-        columns = said["columns"]
+        columns = collection["columns"]
         return cls(
-            tuple(said["cameras"]),
+            tuple(collection["cameras"]),
             None if columns is None else tuple(columns),
-            tuple(said["streams"]),
-            said["source"] == "node",
-            said.get("max_skew_s"),
+            tuple(collection["streams"]),
+            collection["source"] == "node",
+            collection.get("max_skew_s"),
         )
 
     def recorded_cameras(self, cameras: Sequence[str]) -> tuple[str, ...]:
@@ -48,8 +48,8 @@ class Schema:
 
         `qvel`, `effort` and `posed` (it has arms) state whether the robot has such vectors.
         """
-        there = {"qvel": qvel, "effort": effort, "eef": posed, "eef_action": posed}
-        return {name: has and self.records_column(name) for name, has in there.items()}
+        available = {"qvel": qvel, "effort": effort, "eef": posed, "eef_action": posed}
+        return {name: has and self.records_column(name) for name, has in available.items()}
 
     def check(self, newest: Observation) -> None:
         """Raise RecordingError if the robot does not measure a stream that every row must have."""

@@ -56,11 +56,11 @@ def _without_outcome(folder: Path) -> IntegrityCheck:
     It counts as open, unless a copy or a mark shows that it was closed.
     """
     if (folder / OUTCOME_COPY).exists():
-        found = _verify_by_copy(folder, Damage(OUTCOME, "is absent, and was there"))
-        if found.seal and len(found.damage) == 1:
-            why = f"it has no outcome, and a whole copy of it, {OUTCOME_COPY}: repair brings it back"
-            return IntegrityCheck(folder, "open", bytes=found.bytes, seal=found.seal, why=why)
-        return found
+        check = _verify_by_copy(folder, Damage(OUTCOME, "is absent, and was there"))
+        if check.seal and len(check.damage) == 1:
+            reason = f"it has no outcome, and a whole copy of it, {OUTCOME_COPY}: repair brings it back"
+            return IntegrityCheck(folder, "open", bytes=check.bytes, seal=check.seal, why=reason)
+        return check
     damage = known_damage(IntegrityCheck(folder, "open"))
     if not damage and not (folder / MANIFEST).exists():
         raise RecordingError(f"{folder} is no episode: there is no {MANIFEST} in it")
@@ -77,8 +77,8 @@ def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
         return IntegrityCheck(folder, "damaged", (lost, Damage(OUTCOME_COPY, f"is damaged: {error}")))
     if DIGESTS not in outcome:
         return IntegrityCheck(folder, "damaged", (lost, Damage(OUTCOME_COPY, "is no copy of an outcome")))
-    found = _compare_digests(folder, outcome, (), second=False)
-    return IntegrityCheck(folder, "damaged", (lost, *found.damage), found.bytes, found.seal)
+    check = _compare_digests(folder, outcome, (), second=False)
+    return IntegrityCheck(folder, "damaged", (lost, *check.damage), check.bytes, check.seal)
 
 
 def _compare_digests(
@@ -89,15 +89,15 @@ def _compare_digests(
     If `second`, the copy of the outcome counts as one of all files.
     """
     manifest = _manifest(folder)
-    digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
-    found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
-    found += [_verify_copy(folder)] if second and not files and COPY in outcome else []
-    damage = tuple(one for one in found if one is not None)
+    digests = {name: expected for name, expected in outcome[DIGESTS].items() if not files or name in files}
+    damages = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
+    damages += [_verify_copy(folder)] if second and not files and COPY in outcome else []
+    damage = tuple(entry for entry in damages if entry is not None)
     size = sum(digest["bytes"] for digest in digests.values())
     repair = outcome.get("repair")
-    why = str(repair.get("unproven", "")) if isinstance(repair, Mapping) else ""
-    state: State = "damaged" if damage else "unsealed" if why else "sound"
-    return IntegrityCheck(folder, state, damage, size, str(outcome[SEAL]), repair is not None, why)
+    unproven = str(repair.get("unproven", "")) if isinstance(repair, Mapping) else ""
+    state: State = "damaged" if damage else "unsealed" if unproven else "sound"
+    return IntegrityCheck(folder, state, damage, size, str(outcome[SEAL]), repair is not None, unproven)
 
 
 def _verify_copy(folder: Path) -> Damage | None:
@@ -131,10 +131,10 @@ def episodes_in(path: Path) -> list[Path]:
     if _is_episode(path):
         return [path]
     root = path / "episodes" if (path / "episodes").is_dir() else path
-    found = [folder for folder in sorted(root.iterdir()) if _is_episode(folder)]
-    if not found:
+    folders = [folder for folder in sorted(root.iterdir()) if _is_episode(folder)]
+    if not folders:
         raise RecordingError(f"{path} is no episode, and holds none: there is no {MANIFEST} in it")
-    return found
+    return folders
 
 
 def _is_episode(folder: Path) -> bool:
@@ -160,7 +160,7 @@ def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> D
 def _located(name: str, file: BinaryIO, digest: FileDigest, rate: float | None) -> Damage:
     """Return the damage of a file, with the rows of its changed pieces; a changed header makes all rows doubtful."""
     size = file.seek(0, os.SEEK_END)
-    what = (
+    description = (
         "is changed" if size == digest["bytes"] else f"has {size} bytes, was recorded with {digest['bytes']}"
     )
     file.seek(0)
@@ -168,8 +168,8 @@ def _located(name: str, file: BinaryIO, digest: FileDigest, rate: float | None) 
     end = rows = 0
     for piece in digest["pieces"]:
         first, begin = rows, end
-        end, rows, wanted = _piece(piece)
-        if hashlib.sha256(file.read(end - begin)).hexdigest() == wanted:
+        end, rows, expected = _piece(piece)
+        if hashlib.sha256(file.read(end - begin)).hexdigest() == expected:
             continue
         if rows > first:
             spans = _joined(spans, first, rows - 1)
@@ -178,7 +178,7 @@ def _located(name: str, file: BinaryIO, digest: FileDigest, rate: float | None) 
             spans = [(0, last - 1)] if last else []
             break
     times = tuple((first / rate, (last + 1) / rate) for first, last in spans) if rate else ()
-    return Damage(name, what, tuple(spans), times)
+    return Damage(name, description, tuple(spans), times)
 
 
 def _piece(text: str) -> tuple[int, int, str]:

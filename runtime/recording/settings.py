@@ -90,7 +90,7 @@ class RecordingSettings(Settings):
         return {camera: self._size(camera, *size) for camera, size in cameras.items()}
 
     def _size(self, camera: str, height: int, width: int) -> tuple[int, int]:
-        wanted = self.heights.get(camera, self.height)
-        if wanted is None or wanted >= height:
+        target = self.heights.get(camera, self.height)
+        if target is None or target >= height:
             return height, width
-        return wanted, max(2, 2 * round(width * wanted / height / 2))
+        return target, max(2, 2 * round(width * target / height / 2))

@@ -92,7 +92,7 @@ class _Tally:
         return spread(times[:, np.isfinite(times).sum(axis=0) >= 2])
 
     def summary(self) -> Summary:
-        known = self._spread_count > 0
+        has_spread = self._spread_count > 0
         return Summary(
             frames=self.frames,
             duration_s=(self.frames - self._held) / self._layout.fps,
@@ -101,8 +101,8 @@ class _Tally:
             lost=self._flags["lost"],
             stale=self._flags["stale"],
             skewed_rows=self._skewed,
-            skew_mean_s=self._spread_sum / self._spread_count if known else None,
-            skew_max_s=self._spread_max if known else None,
+            skew_mean_s=self._spread_sum / self._spread_count if has_spread else None,
+            skew_max_s=self._spread_max if has_spread else None,
         )
 
 

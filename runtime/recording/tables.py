@@ -236,7 +236,7 @@ def read_table(path: Path, schema: Any) -> TableRead:
         stream = pa.ipc.open_stream(source)
     except (pa.ArrowInvalid, OSError):
         return TableRead(schema.empty_table(), len(data), False)
-    if not any(stream.schema.equals(known) for known in _generations(schema)):
+    if not any(stream.schema.equals(generation) for generation in _generations(schema)):
         raise RecordingError(
             f"{path} has other columns than its manifest says: {_difference(stream.schema, schema)}"
         )
@@ -270,9 +270,9 @@ def _whole_batches(stream: Any, source: Any, *, counted: bool) -> tuple[list[Any
         end, rows = source.tell(), rows + batch.num_rows
 
 
-def _difference(given: Any, expected: Any) -> str:
-    strange = [str(field) for field in given if field not in list(expected)]
-    absent = [str(field) for field in expected if field not in list(given)]
+def _difference(actual: Any, expected: Any) -> str:
+    strange = [str(field) for field in actual if field not in list(expected)]
+    absent = [str(field) for field in expected if field not in list(actual)]
     return f"{', '.join(strange) or 'none'} in the place of {', '.join(absent) or 'another order'}"
 
 

@@ -22,10 +22,10 @@ def find_unreadable(folder: Path) -> tuple[Damage, ...]:
     """
     try:
         episode = open_episode(folder)
-        found = [*_videos(episode), *([] if _failed(episode) else [*_tables(episode), *_events(folder)])]
+        damages = [*_videos(episode), *([] if _failed(episode) else [*_tables(episode), *_events(folder)])]
     except RecordingError as error:
         return (Damage(OUTCOME, f"has no digests, and {error}"),)
-    return tuple(found)
+    return tuple(damages)
 
 
 def _failed(episode: Episode) -> bool:
@@ -44,9 +44,9 @@ def _tables(episode: Episode) -> Iterator[Damage]:
 
 def _videos(episode: Episode) -> Iterator[Damage]:
     for camera, path in episode.videos.items():
-        frames, wanted = count_frames(path), episode.frame_count(camera)
-        if frames < wanted:
-            yield Damage(path.name, f"is torn: {frames} frames can be read, its rows want {wanted}")
+        frames, expected = count_frames(path), episode.frame_count(camera)
+        if frames < expected:
+            yield Damage(path.name, f"is torn: {frames} frames can be read, its rows want {expected}")
 
 
 def _events(folder: Path) -> Iterator[Damage]:

@@ -49,8 +49,8 @@ def to_yuv_planes(picture: UInt8, size: tuple[int, int]) -> av.VideoFrame:
     for number, plane in enumerate(coded[height:].reshape(2, height // 2, width // 2), start=1):
         cv2.extractChannel(colours, number, plane)
     # PyAV 18 takes a buffer of other heights for a lower picture; those are copied.
-    taken = av.VideoFrame.from_numpy_buffer if height % 4 == 0 else av.VideoFrame.from_ndarray
-    frame = taken(coded, format=PIXELS)
+    make_frame = av.VideoFrame.from_numpy_buffer if height % 4 == 0 else av.VideoFrame.from_ndarray
+    frame = make_frame(coded, format=PIXELS)
     frame.colorspace, frame.color_range = Colorspace.ITU601, ColorRange.MPEG
     return frame
 
@@ -155,10 +155,10 @@ class FragmentedVideo:
 
     def _open_stream(self, fps: float, settings: RecordingSettings) -> Any:
         gop = settings.chosen_gop(fps)
-        told = codecs.options(settings.codec, settings.chosen_preset, settings.chosen_crf, gop)
+        options = codecs.options(settings.codec, settings.chosen_preset, settings.chosen_crf, gop)
         stream: Any = self._container.add_stream(settings.codec, rate=self._rate)
         context = stream.codec_context
-        codecs.configure_context(context, settings.codec, self._size, self._rate, told, gop)
+        codecs.configure_context(context, settings.codec, self._size, self._rate, options, gop)
         context.colorspace, context.color_range = Colorspace.ITU601, ColorRange.MPEG
         return stream
 
