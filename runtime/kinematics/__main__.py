@@ -18,9 +18,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Compile for the named robots, or for all if none are named; return 1 if that fails for one of them."""
     parser = argparse.ArgumentParser(prog="python -m runtime.kinematics", description=__doc__)
     parser.add_argument("robots", metavar="ROBOT", nargs="*", help="a robot's name or a folder")
-    wanted = parser.parse_args(arguments).robots or robots.robot_names()
+    names = parser.parse_args(arguments).robots or robots.robot_names()
     try:
-        for name in wanted:
+        for name in names:
             begun = time.perf_counter()
             for robot in (
                 robots.load_robot(name),

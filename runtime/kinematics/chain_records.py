@@ -48,18 +48,18 @@ class ChainSequence:
 
 def chain_records(ways: Sequence[ChainSequence]) -> Records:
     """Return one record per sequence [A], padded to the length of the longest."""
-    longest = max((sum(len(chain.moving) for chain in way.chains) for way in ways), default=0)
+    longest = max((sum(len(chain.moving) for chain in sequence.chains) for sequence in ways), default=0)
     records = np.zeros(len(ways), dtype=chain_type(max(1, longest)))
     records["fixed"] = _flat(np.eye(4))
     records["drive"] = -1
-    for record, way in zip(records, ways, strict=True):
-        _fill(record, way)
+    for record, sequence in zip(records, ways, strict=True):
+        _fill(record, sequence)
     return records
 
 
-def _fill(record: Record, way: ChainSequence) -> None:
+def _fill(record: Record, sequence: ChainSequence) -> None:
     place, before = 0, np.eye(4)
-    for chain, dims in zip(way.chains, way.dims, strict=True):
+    for chain, dims in zip(sequence.chains, sequence.dims, strict=True):
         for joint in chain.moving:
             basis = _basis(joint.axis)
             record["fixed"][place] = _flat(before @ joint.origin @ basis)

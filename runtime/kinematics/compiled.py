@@ -50,9 +50,9 @@ class Config(KinematicsSettings):
 
 def build(config: Config, robot: Robot) -> CompiledKinematics:
     """Return the kinematics of the robot's arms, with everything compiled or loaded that `solve` needs."""
-    made = CompiledKinematics(robot, config)
-    made.warm_up()
-    return made
+    kinematics = CompiledKinematics(robot, config)
+    kinematics.warm_up()
+    return kinematics
 
 
 def is_compiled(robot: Robot) -> bool:
@@ -154,35 +154,35 @@ class CompiledKinematics(Kinematics):
             )
         if anchor_row < 0:
             raise KinematicsError(f"anchor_row = {anchor_row} was given; allowed: 0 or above")
-        held = seed if anchor is None else self._vector("an anchor", anchor)
+        reference = seed if anchor is None else self._vector("an anchor", anchor)
         row = -1 if anchor is None else int(anchor_row)
-        found = self._solve_rows(self._arms, targets, seed, dt, held, row)
+        result = self._solve_rows(self._arms, targets, seed, dt, reference, row)
         if dt is not None:
-            self._replan_missed(found, targets, seed, dt, held, row)
-        return found
+            self._replan_missed(result, targets, seed, dt, reference, row)
+        return result
 
     def _replan_missed(
-        self, found: IkResult, targets: Float64, seed: Float64, dt: float, held: Float64, row: int
+        self, result: IkResult, targets: Float64, seed: Float64, dt: float, reference: Float64, row: int
     ) -> None:
-        """Replan in `found` the arms that reach the first pose, but miss a later one or end near limits.
+        """Replan in `result` the arms that reach the first pose, but miss a later one or end near limits.
 
         Ending near a limit matters because the next chunk is unknown, and may continue towards the limit. `row` is the
-        anchor's row, -1 without an anchor, and `held` its joints [D].
+        anchor's row, -1 without an anchor, and `reference` its joints [D].
         """
         begin = row if row >= 0 else 1
         if begin >= len(targets):
             return
-        late = arms_missing_targets(found, begin)
+        late = arms_missing_targets(result, begin)
         for index, arm in enumerate(self._arms):
             room = partial(_limit_margin, arm)
-            spare = room(found.q[-1])
-            cramped = spare < MIN_LIMIT_MARGIN and found.reached[begin:, index].all()
+            spare = room(result.q[-1])
+            cramped = spare < MIN_LIMIT_MARGIN and result.reached[begin:, index].all()
             if index not in late and not cramped:
                 continue
             least = spare + ROOMIER if cramped else -np.inf
             dims = arm["dims"][: arm["joints"]]
             start = seed.copy()
-            start[dims] = (held if row >= 0 else found.q[0])[dims]
+            start[dims] = (reference if row >= 0 else result.q[0])[dims]
             poses = np.ascontiguousarray(targets[begin:, index : index + 1])
             sweep = partial(self._solve_rows, self._arms[index : index + 1])
             plan = replan(sweep, poses, start, dt, dims, self._postures[index], room, least)
@@ -191,10 +191,10 @@ class CompiledKinematics(Kinematics):
                 plan = sweep(poses, start, dt, start, 0, home_rate=0.0)
                 plan = plan if plan.reached.all() else None
             if plan is not None:
-                found.q[begin:, dims] = plan.q[:, dims]
-                found.position_error[begin:, index] = plan.position_error[:, 0]
-                found.rotation_error[begin:, index] = plan.rotation_error[:, 0]
-                found.flags[begin:, index] = plan.flags[:, 0]
+                result.q[begin:, dims] = plan.q[:, dims]
+                result.position_error[begin:, index] = plan.position_error[:, 0]
+                result.rotation_error[begin:, index] = plan.rotation_error[:, 0]
+                result.flags[begin:, index] = plan.flags[:, 0]
 
     def _solve_rows(
         self,
@@ -235,18 +235,18 @@ class CompiledKinematics(Kinematics):
             raise KinematicsError(_WRONG[wrong])
         return IkResult(q, away, astray, flags)
 
-    def _targets(self, given: Float64) -> Float64:
-        targets = np.array(given, dtype=np.float64, order="C")
+    def _targets(self, poses: Float64) -> Float64:
+        targets = np.array(poses, dtype=np.float64, order="C")
         if targets.ndim != 3 or targets.shape[1:] != (len(self._arms), 7):
             raise KinematicsError(
                 f"targets of shape {targets.shape} were given; allowed: [T, {len(self._arms)}, 7]"
             )
         return targets
 
-    def _vector(self, what: str, given: Float64) -> Float64:
-        vector = np.array(given, dtype=np.float64, order="C")
+    def _vector(self, label: str, values: Float64) -> Float64:
+        vector = np.array(values, dtype=np.float64, order="C")
         if vector.shape != (self._dim,):
-            raise KinematicsError(f"{what} of shape {vector.shape} was given; allowed: [{self._dim}]")
+            raise KinematicsError(f"{label} of shape {vector.shape} was given; allowed: [{self._dim}]")
         return vector
 
 
@@ -289,8 +289,8 @@ def _limit_margin(arm: Record, q: Float64) -> float:
         return np.inf
     at = q[arm["dims"][:count]]
     rooms = np.concatenate([at - arm["lower"][:count], arm["upper"][:count] - at])
-    kept = np.concatenate([arm["below"][:count], arm["above"][:count]])
-    return float(rooms[kept >= _ROOM].min(initial=np.inf) / _ROOM)
+    margins = np.concatenate([arm["below"][:count], arm["above"][:count]])
+    return float(rooms[margins >= _ROOM].min(initial=np.inf) / _ROOM)
 
 
 def _carrier_chain(group: Group) -> ChainSequence:

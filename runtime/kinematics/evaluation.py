@@ -23,9 +23,9 @@ def evaluate_solution(
     shape = (len(q), len(robot.arms))
     position, rotation, flags = np.empty(shape), np.empty(shape), np.zeros(shape, dtype=np.uint8)
     for index, arm in enumerate(robot.arms):
-        found, wanted = arm.transform(q), transform_of(targets[:, index])
-        position[:, index] = np.linalg.norm(found[:, :3, 3] - wanted[:, :3, 3], axis=-1)
-        apart = rotation_vector(wanted[:, :3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))
+        reached, target = arm.transform(q), transform_of(targets[:, index])
+        position[:, index] = np.linalg.norm(reached[:, :3, 3] - target[:, :3, 3], axis=-1)
+        apart = rotation_vector(target[:, :3, :3] @ np.swapaxes(reached[:, :3, :3], -1, -2))
         rotation[:, index] = np.linalg.norm(apart, axis=-1)
         flags[:, index] = _bound(robot, arm, q, bounds)
         flags[:, index] |= _singular(arm, q, settings.singular_below)

@@ -28,13 +28,13 @@ def folder() -> Path | None:
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     roots = [Path(chosen)] if chosen else [_KERNELS / "__pycache__", home / "eva-web"]
     for root in roots:
-        found = root / f"kernels-{_digest()}"
+        path = root / f"kernels-{_digest()}"
         try:
-            found.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=found).close()
+            path.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=path).close()
         except OSError:
             continue
-        return found
+        return path
     logging.getLogger(__name__).warning(
         "compiled kinematics are kept in memory alone, and every start takes seconds longer: %s cannot be written; "
         "name a folder in NUMBA_CACHE_DIR",
@@ -45,39 +45,39 @@ def folder() -> Path | None:
 
 def is_compiled(robot: Robot) -> bool:
     """Return True if the robot's kernels are on disk, so that they load within a second, without compilation."""
-    kept = folder()
-    if kept is None:
+    cache = folder()
+    if cache is None:
         return False
     try:
-        noted = json.loads((kept / _name(robot)).read_text("utf-8"))
+        noted = json.loads((cache / _name(robot)).read_text("utf-8"))
     except (OSError, ValueError):
         return False
-    here = _kernels(kept)
-    return bool(noted) and all(here.get(name) == size for name, size in noted.items())
+    stored = _kernels(cache)
+    return bool(noted) and all(stored.get(name) == size for name, size in noted.items())
 
 
 def note_compiled(robot: Robot) -> None:
     """Record that the robot's kernels are on disk, with names and sizes of their files."""
-    if (kept := folder()) is not None:
-        part = kept / f"{_name(robot)}.{os.getpid()}"
-        part.write_text(json.dumps(_kernels(kept)), "utf-8")
-        part.replace(kept / _name(robot))
+    if (cache := folder()) is not None:
+        part = cache / f"{_name(robot)}.{os.getpid()}"
+        part.write_text(json.dumps(_kernels(cache)), "utf-8")
+        part.replace(cache / _name(robot))
 
 
 def forget() -> bool:
     """Remove all cached files, so that they are compiled again; return False if there were none."""
-    kept = folder()
-    files = [] if kept is None else [file for file in kept.rglob("*") if file.is_file()]
+    cache = folder()
+    files = [] if cache is None else [file for file in cache.rglob("*") if file.is_file()]
     for file in files:
         file.unlink(missing_ok=True)
     return bool(files)
 
 
-def _kernels(kept: Path) -> dict[str, int]:
+def _kernels(cache: Path) -> dict[str, int]:
     """Return the sizes by name of the files with machine code that also have an index file of numba."""
     return {
-        file.relative_to(kept).as_posix(): file.stat().st_size
-        for file in sorted(kept.rglob("*.nbc"))
+        file.relative_to(cache).as_posix(): file.stat().st_size
+        for file in sorted(cache.rglob("*.nbc"))
         if any(index.stat().st_size for index in file.parent.glob(f"{_function(file)}*.nbi"))
     }
 
@@ -95,18 +95,18 @@ def _digest() -> str:
 
     It is needed because numba compares only a function's own file, and would use outdated functions that it calls.
     """
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in sorted(_KERNELS.glob("*.py")):
-        found.update(file.read_bytes())
-    return found.hexdigest()[:16]
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _name(robot: Robot) -> str:
     """Return the file name of the robot's record, which depends on its model, the compiler and the processor."""
-    found = hashlib.sha256(robot.urdf.read_bytes())
+    digest = hashlib.sha256(robot.urdf.read_bytes())
     for part in (robot.joint_names, _numba(), _processor()):
-        found.update(repr(part).encode())
-    return f"{robot.name}-{found.hexdigest()[:16]}.compiled"
+        digest.update(repr(part).encode())
+    return f"{robot.name}-{digest.hexdigest()[:16]}.compiled"
 
 
 def _numba() -> str:

@@ -51,10 +51,10 @@ class LazyKinematics(Kinematics):
         Raises:
             KinematicsError: The joint vectors have another width.
         """
-        made = self._made
-        if made is None or not made.done() or made.exception() is not None:
+        future = self._made
+        if future is None or not future.done() or future.exception() is not None:
             return self._forward.forward(q)
-        return made.result().forward(q)
+        return future.result().forward(q)
 
     def solve(
         self,

@@ -38,10 +38,10 @@ class Config(KinematicsSettings):
 
 def build(config: Config, robot: Robot) -> PyrokiKinematics:
     """Return the kinematics of the robot's arms, compiled for chunks of up to 64 rows, which takes some ten seconds."""
-    made = PyrokiKinematics(robot, config)
+    kinematics = PyrokiKinematics(robot, config)
     home = robot.poses["home"]
-    made.solve(made.forward(home)[None], home)
-    return made
+    kinematics.solve(kinematics.forward(home)[None], home)
+    return kinematics
 
 
 def is_compiled(robot: Robot) -> bool:
@@ -93,8 +93,8 @@ class PyrokiKinematics(Kinematics):
         low = np.repeat(self._robot.lower[None], len(targets), axis=0)
         high = np.repeat(self._robot.upper[None], len(targets), axis=0)
         for index, arm in enumerate(self._arms):
-            asked = _ArmTask(targets[:, index], seed, dt, anchor, anchor_row)
-            q[:, arm.dims], low[:, arm.dims], high[:, arm.dims] = arm.follow(asked)
+            task = _ArmTask(targets[:, index], seed, dt, anchor, anchor_row)
+            q[:, arm.dims], low[:, arm.dims], high[:, arm.dims] = arm.follow(task)
         return evaluate_solution(self._robot, self._config, q, targets, (low, high))
 
 
@@ -126,47 +126,48 @@ class _Arm:
         goals = np.linalg.inv(self._group.carried(asked.seed)) @ transform_of(_unit(asked.targets))
         poses = np.concatenate([quaternion_of_matrix(goals[:, :3, :3]), goals[:, :3, 3]], axis=-1)
         filled = np.concatenate([poses, np.repeat(poses[-1:], -rows % _BUCKET, axis=0)])
-        held, steps = self._bounds(asked, len(filled))
+        reference, steps = self._bounds(asked, len(filled))
         seed = np.clip(asked.seed[self.dims], self._lower, self._upper)
-        held = np.clip(held, self._lower, self._upper)
-        given = (
+        reference = np.clip(reference, self._lower, self._upper)
+        inputs = (
             filled,
             steps,
             np.arange(len(filled)) == asked.anchor_row,
             seed,
-            held,
+            reference,
             self._lower,
             self._upper,
         )
         q, low, high = (
-            np.asarray(part, np.float64)[:rows] for part in self._scan(self._described, *map(_float32, given))
+            np.asarray(part, np.float64)[:rows]
+            for part in self._scan(self._described, *map(_float32, inputs))
         )
         # float32 may round beyond the box by its last digit
         low, high = np.maximum(low, self._lower), np.minimum(high, self._upper)
-        return self._cut(q, asked, steps[:rows], held), low, high
+        return self._cut(q, asked, steps[:rows], reference), low, high
 
-    def _bounds(self, asked: _ArmTask, rows: int) -> tuple[Float64, Float64]:
+    def _bounds(self, task: _ArmTask, rows: int) -> tuple[Float64, Float64]:
         """Return the joints [n] before the anchor's row, and the largest step of each row from its predecessor [rows,
         n].
         """
         steps = np.full((rows, len(self.dims)), np.inf)
-        held = (asked.seed if asked.anchor is None else np.asarray(asked.anchor, np.float64))[self.dims]
-        if asked.dt is not None:
-            first = 1 if asked.anchor is None else asked.anchor_row
-            steps[first:] = self._speed * asked.dt
-        return held, steps
+        reference = (task.seed if task.anchor is None else np.asarray(task.anchor, np.float64))[self.dims]
+        if task.dt is not None:
+            first = 1 if task.anchor is None else task.anchor_row
+            steps[first:] = self._speed * task.dt
+        return reference, steps
 
-    def _cut(self, q: Float64, asked: _ArmTask, steps: Float64, held: Float64) -> Float64:
+    def _cut(self, q: Float64, task: _ArmTask, steps: Float64, reference: Float64) -> Float64:
         """Return the rows [T, n] clipped in float64 to joint limits and to their `steps` from the row before.
 
-        The anchor's row is clipped to its step from `held`.
+        The anchor's row is clipped to its step from `reference`.
         """
         cut = np.clip(q, self._lower, self._upper)
         for row in range(len(cut)):
-            anchored = asked.anchor is not None and row == asked.anchor_row
+            anchored = task.anchor is not None and row == task.anchor_row
             if row == 0 and not anchored:
                 continue
-            before = held if anchored else cut[row - 1]
+            before = reference if anchored else cut[row - 1]
             cut[row] = np.clip(cut[row], before - steps[row], before + steps[row])
         return cut
 
@@ -183,14 +184,14 @@ class _Libraries(NamedTuple):
 
 def _libraries() -> _Libraries:
     try:
-        made = _Libraries(*(importlib.import_module(name) for name in _Libraries._fields))
+        libraries = _Libraries(*(importlib.import_module(name) for name in _Libraries._fields))
     except ImportError as error:
         raise SetupError(
             f'kinematics.kind = "pyroki": {error}; install PyRoki (chungmin99/pyroki) and jaxls (brentyi/jaxls) from '
             'their repositories, the jaxls of the package index is another project; or use kind = "compiled"'
         ) from error
     importlib.import_module("loguru").logger.disable("jaxls")  # it logs every problem that it builds
-    return made
+    return libraries
 
 
 def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
@@ -232,8 +233,8 @@ def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
         describe.Joint(name="tail", type="fixed", parent=links[-2], child=links[-1], origin=group.chain.tail)
     )
     described = describe.Robot(name="arm", links=[describe.Link(name=link) for link in links], joints=joints)
-    made = libraries.pyroki.Robot.from_urdf(describe.URDF(robot=described, load_meshes=False))
-    return dataclasses.replace(made, joint_var_cls=_variable_of(libraries, len(moving)))
+    parsed = libraries.pyroki.Robot.from_urdf(describe.URDF(robot=described, load_meshes=False))
+    return dataclasses.replace(parsed, joint_var_cls=_variable_of(libraries, len(moving)))
 
 
 @functools.cache  # cache: what is compiled is bound to it
@@ -266,9 +267,9 @@ def _scan_of(libraries: _Libraries, config: Config) -> Any:
 
     def frame(robot: Any, carry: Any, row: Any) -> Any:
         variable = robot.joint_var_cls(0)
-        before, start, held, lower, upper = carry
+        before, start, reference, lower, upper = carry
         pose, step, anchored = row
-        base = jnp.where(anchored > 0, held, before)
+        base = jnp.where(anchored > 0, reference, before)
         low, high = jnp.maximum(lower, base - step), jnp.minimum(upper, base + step)
         start = jnp.clip(start, low, high)
         costs = [
@@ -294,12 +295,12 @@ def _scan_of(libraries: _Libraries, config: Config) -> Any:
             )
         )
         q = jnp.clip(solution[variable], low, high)
-        return (q, q, held, lower, upper), (q, low, high)
+        return (q, q, reference, lower, upper), (q, low, high)
 
     def chunk(
-        robot: Any, poses: Any, steps: Any, anchored: Any, seed: Any, held: Any, lower: Any, upper: Any
+        robot: Any, poses: Any, steps: Any, anchored: Any, seed: Any, reference: Any, lower: Any, upper: Any
     ) -> Any:
-        first = (seed, seed, held, lower, upper)
+        first = (seed, seed, reference, lower, upper)
         return jax.lax.scan(functools.partial(frame, robot), first, (poses, steps, anchored))[1]
 
     return jax.jit(chunk)

@@ -72,17 +72,17 @@ def _ends(
     sweep: SolveRows, last: Float64, start: Float64, dims: NDArray[np.intp], starts: Float64
 ) -> Iterator[Float64]:
     """Yield distinct joints [D] that reach the last pose [1, 1, 7], the nearest to `start` first."""
-    found: list[Float64] = []
+    solutions: list[Float64] = []
     for tried, posture in enumerate(starts):
-        if tried == _HOPELESS and not found:
+        if tried == _HOPELESS and not solutions:
             return
         seed = start.copy()
         seed[dims] = posture
         solved = sweep(last, seed, None, seed, -1)
         if solved.reached.all():
-            found.append(solved.q[0])
-    taken: list[Float64] = []
-    for end in sorted(found, key=lambda q: float(np.abs(q - start).max())):
-        if all(np.abs(end - other).max() > _SAME for other in taken):
-            taken.append(end)
+            solutions.append(solved.q[0])
+    distinct: list[Float64] = []
+    for end in sorted(solutions, key=lambda q: float(np.abs(q - start).max())):
+        if all(np.abs(end - earlier).max() > _SAME for earlier in distinct):
+            distinct.append(end)
             yield end

@@ -158,8 +158,8 @@ def _wrong(targets: Float64, seed: Float64, anchor: Float64) -> int:
 def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
     """Set the start of the first frame to the seed, clipped to the limits."""
     for i in range(len(frame.q)):
-        there = seed[0, arm.dims[i]] if i < arm.joints else 0.0
-        frame.q[i] = min(max(there, arm.lower[i]), arm.upper[i])
+        value = seed[0, arm.dims[i]] if i < arm.joints else 0.0
+        frame.q[i] = min(max(value, arm.lower[i]), arm.upper[i])
         frame.before[i] = frame.q[i]
 
 
@@ -169,10 +169,10 @@ def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
     for i in range(len(frame.q)):
         frame.lower[i], frame.upper[i] = arm.lower[i], arm.upper[i]
         if dt > 0:
-            way = _WITHIN * arm.speed[i] * dt
+            reach = _WITHIN * arm.speed[i] * dt
             frame.before[i] = min(max(frame.before[i], arm.lower[i]), arm.upper[i])
-            frame.lower[i] = max(arm.lower[i], frame.before[i] - way)
-            frame.upper[i] = min(arm.upper[i], frame.before[i] + way)
+            frame.lower[i] = max(arm.lower[i], frame.before[i] - reach)
+            frame.upper[i] = min(arm.upper[i], frame.before[i] + reach)
 
 
 @device_function
@@ -197,9 +197,9 @@ def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Recor
     frame.
     """
     for i in range(arm.joints):
-        way = _GUIDED * arm.speed[i] * dt
-        there = min(max(guide[row, arm.dims[i]], frame.before[i] - way), frame.before[i] + way)
-        frame.centre[i] = min(max(there, frame.lower[i]), frame.upper[i])
+        reach = _GUIDED * arm.speed[i] * dt
+        guided = min(max(guide[row, arm.dims[i]], frame.before[i] - reach), frame.before[i] + reach)
+        frame.centre[i] = min(max(guided, frame.lower[i]), frame.upper[i])
         frame.tried[0, i] = frame.centre[i]
 
 

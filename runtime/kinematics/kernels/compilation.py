@@ -22,14 +22,14 @@ def kernel(loop: Loop) -> Loop:
     """Compile a loop that Python calls, at its first call with each set of types; cached on disk if a folder is
     writable.
     """
-    made = numba.njit(cache=CACHE is not None, nogil=True, fastmath=_FAST, error_model="numpy")(loop)
-    return cast(Loop, made)
+    compiled = numba.njit(cache=CACHE is not None, nogil=True, fastmath=_FAST, error_model="numpy")(loop)
+    return cast(Loop, compiled)
 
 
 def device_function(function: Loop) -> Loop:
     """Compile a function that is inlined into kernels."""
-    made = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)(function)
-    return cast(Loop, made)
+    compiled = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)(function)
+    return cast(Loop, compiled)
 
 
 CACHE = kernel_cache.folder()

@@ -78,20 +78,20 @@ def compute_jacobian(
         if drive < 0:
             continue
         x, y, z = frames[i, 2], frames[i, 5], frames[i, 8]
-        way, turn = position * chain.factor[i], rotation * chain.factor[i]
+        shift, turn = position * chain.factor[i], rotation * chain.factor[i]
         if chain.slides[i]:
-            jacobian[0, drive] += way * x
-            jacobian[1, drive] += way * y
-            jacobian[2, drive] += way * z
+            jacobian[0, drive] += shift * x
+            jacobian[1, drive] += shift * y
+            jacobian[2, drive] += shift * z
             continue
         a, b, c = (
             frames[last, 9] - frames[i, 9],
             frames[last, 10] - frames[i, 10],
             frames[last, 11] - frames[i, 11],
         )
-        jacobian[0, drive] += way * (y * c - z * b)
-        jacobian[1, drive] += way * (z * a - x * c)
-        jacobian[2, drive] += way * (x * b - y * a)
+        jacobian[0, drive] += shift * (y * c - z * b)
+        jacobian[1, drive] += shift * (z * a - x * c)
+        jacobian[2, drive] += shift * (x * b - y * a)
         jacobian[3, drive] += turn * x
         jacobian[4, drive] += turn * y
         jacobian[5, drive] += turn * z

@@ -77,7 +77,7 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
     """
     n = len(frame.q)
     q, tried, box = frame.q, frame.tried, frame.box
-    rest = costs.rest * costs.rest
+    rest_weight = costs.rest * costs.rest
     cost, missed, predicted, damping, growth = np.inf, np.inf, 0.0, 0.0, 2.0
     for iteration in range(costs.max_iterations + 1):
         compute_fk(chain, tried, 0, frame.reach)
@@ -85,10 +85,10 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
         strayed = 0.0
         for i in range(n):
             strayed += (tried[0, i] - frame.centre[i]) ** 2
-        fall = cost - (off + rest * strayed)
+        fall = cost - (off + rest_weight * strayed)
         if fall > 0 or iteration == 0:
             stalled = iteration > 0 and fall <= _STALLED * cost
-            cost, missed = off + rest * strayed, off
+            cost, missed = off + rest_weight * strayed, off
             for i in range(n):
                 q[i] = tried[0, i]
             for k in range(6):
@@ -100,7 +100,7 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
                 damping *= max(1 / 3, 1 - (2 * fall / predicted - 1) ** 3)
                 damping = damping if damping > _LEAST_DAMPING else 0.0
             growth = 2.0
-            _set_quadratic(rest, frame)
+            _set_quadratic(rest_weight, frame)
         else:
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0

@@ -33,10 +33,10 @@ def compute_sincos(turns: Float64) -> None:
     for index in range(turns.shape[1]):
         angle = turns[0, index]
         quarters = np.floor(angle * _QUARTERS + 0.5)
-        rest = ((angle - quarters * _FIRST) - quarters * _SECOND) - quarters * _THIRD
-        square = rest * rest
+        remainder = ((angle - quarters * _FIRST) - quarters * _SECOND) - quarters * _THIRD
+        square = remainder * remainder
         sine = _S3 + square * (_S4 + square * (_S5 + square * _S6))
-        sine = rest + rest * square * (_S1 + square * (_S2 + square * sine))
+        sine = remainder + remainder * square * (_S1 + square * (_S2 + square * sine))
         cosine = _C3 + square * (_C4 + square * (_C5 + square * _C6))
         cosine = 1 - 0.5 * square + square * square * (_C1 + square * (_C2 + square * cosine))
         turn = quarters - 4 * np.floor(0.25 * quarters)  # 0, 1, 2 or 3 quarters
