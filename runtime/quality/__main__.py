@@ -67,12 +67,12 @@ def _reports(options: argparse.Namespace, settings: QualitySettings) -> Iterator
 def _episodes(path: Path) -> list[Path]:
     if (path / "manifest.json").exists():
         return [path]
-    found = sorted(manifest.parent for manifest in path.glob("*/manifest.json"))
-    if not found:
+    folders = sorted(manifest.parent for manifest in path.glob("*/manifest.json"))
+    if not folders:
         raise RecordingError(
             f"{path} is no episode and no dataset: neither manifest.json nor {layout.INFO} is in it"
         )
-    return found
+    return folders
 
 
 def _lines(report: Report) -> list[str]:

@@ -55,9 +55,9 @@ class DatasetSource(EpisodeSource):
         self._entry = dataset.entry(index)
         self._features = dataset.features
         self._state = self._state_column(state)
-        ours = layout.read_lines(dataset.root / layout.EVA_EPISODES)
-        told = next((line for line in ours if line.get("episode_index") == index), {})
-        uuid, self.drawn = str(told.get("uuid", "")), told.get("simulated") is True
+        lines = layout.read_lines(dataset.root / layout.EVA_EPISODES)
+        recorded = next((line for line in lines if line.get("episode_index") == index), {})
+        uuid, self.drawn = str(recorded.get("uuid", "")), recorded.get("simulated") is True
         self.name = uuid or f"{dataset.root.name}#{index}"
         self.fps = dataset.fps
         self.frames = self._entry.length
@@ -93,12 +93,12 @@ class DatasetSource(EpisodeSource):
         feature = self._features[name]
         width = int(feature["shape"][0])
         names = _names(feature.get("names"))
-        told = names if len(names) == width else tuple(f"number {k}" for k in range(width))
+        labels = names if len(names) == width else tuple(f"number {k}" for k in range(width))
         poses = name in _POSES and width % EEF_WIDTH == 0
         role = (
             "state" if name == self._state else "action" if name == ACTION else "poses" if poses else "other"
         )
-        return Vector(width, told, role, name in _SPARSE)
+        return Vector(width, labels, role, name in _SPARSE)
 
     def _cameras(self) -> dict[str, str]:
         """Return the picture feature of each camera, by camera key."""
@@ -118,14 +118,14 @@ class DatasetSource(EpisodeSource):
         first = 0
         try:
             table = pads.dataset(str(path), format="parquet")
-            there = set(table.schema.names)
-            absent = [name for name in self.vectors if name not in there]
+            stored = set(table.schema.names)
+            absent = [name for name in self.vectors if name not in stored]
             if absent:
                 raise RecordingError(f"{path} has no column {absent}, though the metadata declare it")
-            wanted = [name for name in self._required_columns() if name in there]
+            columns = [name for name in self._required_columns() if name in stored]
             chosen = pads.field("episode_index") == self._entry.index if self._entry.shared else None
             scanned = table.scanner(
-                columns=wanted, filter=chosen, batch_size=BLOCK_ROWS, batch_readahead=1, use_threads=False
+                columns=columns, filter=chosen, batch_size=BLOCK_ROWS, batch_readahead=1, use_threads=False
             )
             for batch in scanned.to_batches():
                 if batch.num_rows:
@@ -138,8 +138,8 @@ class DatasetSource(EpisodeSource):
 
     def _required_columns(self) -> list[str]:
         scalars = [_INDEX, "timestamp", "tick_time", "control_source"]
-        ours = [name for name in self._features if name.startswith((CAPTURE, REPEATED, LOST))]
-        return [*self.vectors, *scalars, *ours]
+        quality_columns = [name for name in self._features if name.startswith((CAPTURE, REPEATED, LOST))]
+        return [*self.vectors, *scalars, *quality_columns]
 
     def _block(self, batch: Any, first: int) -> Block:
         columns = {name: batch.column(name) for name in batch.schema.names}
@@ -160,7 +160,7 @@ class DatasetSource(EpisodeSource):
             lost=_marks(plain, LOST),
             simulated=None
             if sources is None
-            else np.array([one == "sim" for one in sources.to_pylist()], np.bool_),
+            else np.array([source == "sim" for source in sources.to_pylist()], np.bool_),
         )
 
     def open_frames(self, camera: str, sampling: int) -> FrameStream:
@@ -177,10 +177,10 @@ class DatasetSource(EpisodeSource):
 
     def joints(self) -> tuple[JointSpecs | None, str]:
         if not self._state:
-            there = ", ".join(self.vectors) or "none"
+            available = ", ".join(self.vectors) or "none"
             return (
                 None,
-                f"motion is not checked: no column of measured joints, there are {there} (say it with --state)",
+                f"motion is not checked: no column of measured joints, there are {available} (say it with --state)",
             )
         names = self.vectors[self._state].names
         robot = self._robot or str(self._dataset.info.get("robot_type") or "")
@@ -201,17 +201,19 @@ def _marks(columns: Mapping[str, Float64], prefix: str) -> dict[str, Bools]:
     }
 
 
-def _names(given: Any) -> tuple[str, ...]:
+def _names(stated: Any) -> tuple[str, ...]:
     """Return the names of a feature's dimensions, from a list or a table with one list."""
-    if isinstance(given, Mapping):
-        given = next((value for value in given.values() if isinstance(value, list)), [])
-    return tuple(map(str, given)) if isinstance(given, list) else ()
+    if isinstance(stated, Mapping):
+        stated = next((value for value in stated.values() if isinstance(value, list)), [])
+    return tuple(map(str, stated)) if isinstance(stated, list) else ()
 
 
 def _scalars(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return numbers as float64 [N], also from lists of length one; NaN for missing values."""
     while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-        column = pa.array([None if one is None or len(one) != 1 else one[0] for one in column.to_pylist()])
+        column = pa.array(
+            [None if item is None or len(item) != 1 else item[0] for item in column.to_pylist()]
+        )
     return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64)
 
 

@@ -94,8 +94,8 @@ class VideoFrameStream:
             frame, full = frame.reformat(format="gray", dst_color_range="JPEG"), True
         plane = frame.planes[0]
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
-        taken = rows[: frame.height : self._sampling, : frame.width : self._sampling].astype(np.float32)
-        luma = taken if full else np.clip((taken - 16.0) * (255.0 / 219.0), 0.0, 255.0)
+        sampled = rows[: frame.height : self._sampling, : frame.width : self._sampling].astype(np.float32)
+        luma = sampled if full else np.clip((sampled - 16.0) * (255.0 / 219.0), 0.0, 255.0)
         return LumaFrame(luma, frame.height, frame.width, bool(frame.key_frame), time)
 
     def close(self) -> None:
@@ -113,8 +113,8 @@ class StoredFrameStream:
         for number in range(len(self._pictures)):
             picture = self._pictures[number]
             height, width = picture.shape[:2]
-            taken = picture[:: self._sampling, :: self._sampling].astype(np.float32)
-            luma = (taken @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.float32)
+            sampled = picture[:: self._sampling, :: self._sampling].astype(np.float32)
+            luma = (sampled @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.float32)
             yield LumaFrame(luma, height, width, True, None)
 
     def close(self) -> None:

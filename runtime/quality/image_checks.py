@@ -68,12 +68,12 @@ class ImageCheck:
             figures[row] = self._figures(shot, first + row)
             keys[row] = shot.key
         mean, deviation, change, off = figures.T
-        there = np.isfinite(mean)
+        present = np.isfinite(mean)
         if self._film is not None:
-            self._runs["no_picture"].add(first, ~there & ~beyond)
-        black = there & (mean <= self._settings.black)
+            self._runs["no_picture"].add(first, ~present & ~beyond)
+        black = present & (mean <= self._settings.black)
         self._runs["black"].add(first, black, -np.nan_to_num(mean))
-        uniform = there & ~black & (deviation <= self._settings.uniform)
+        uniform = present & ~black & (deviation <= self._settings.uniform)
         self._runs["uniform"].add(first, uniform, -np.nan_to_num(deviation))
         self._runs["video_time"].add(first, np.nan_to_num(off) > 0.5 / self._fps, np.nan_to_num(off))
         self._repeats.add(first, change, keys, black | uniform, moving, repeated & ~beyond, lost)
@@ -92,8 +92,8 @@ class ImageCheck:
         size = (shot.height, shot.width)
         if self._size is not None and size != self._size and size != self._strange:
             self._strange = size
-            told = f"{self._camera} is {size[1]}x{size[0]}, declared is {self._size[1]}x{self._size[0]}"
-            self._flag("dimensions", "error", frame, frame, f"from frame {frame} on {told}")
+            text = f"{self._camera} is {size[1]}x{size[0]}, declared is {self._size[1]}x{self._size[0]}"
+            self._flag("dimensions", "error", frame, frame, f"from frame {frame} on {text}")
         before, self._before = self._before, shot.luma
         change = np.nan
         if before is not None:
@@ -194,30 +194,30 @@ class _RepeatCheck:
         lost: Bools,
     ) -> None:
         """Check rows; `dull` pictures (black or uniform) and repeats for `lost` pictures are reported elsewhere."""
-        said = repeated | lost
+        marked = repeated | lost
         self._count("repeated", first, repeated & ~lost)
         self._said.add(first, repeated & ~lost)
         if self._drawn:
             return
         neutral = keys & ~np.concatenate([[self._key], keys[:-1]])
         same = change <= self._settings.same
-        self._seen.add(first, (same | neutral) & moving & ~said & ~dull, same.astype(np.float64))
+        self._seen.add(first, (same | neutral) & moving & ~marked & ~dull, same.astype(np.float64))
         # A camera of half the rate shows each picture twice: it changes, stays, changes.
         changes = np.concatenate([self._last, change])
         much = changes > CHANGED * self._settings.same
-        twice = much[:-2] & (changes[1:-1] <= self._settings.same) & much[2:]
-        self._count("skipped", first - 1, twice & ~said)
+        doubled = much[:-2] & (changes[1:-1] <= self._settings.same) & much[2:]
+        self._count("skipped", first - 1, doubled & ~marked)
         self._last, self._key = changes[-2:], bool(keys[-1])
 
-    def _count(self, what: str, first: int, marked: Bools) -> None:
+    def _count(self, kind: str, first: int, marked: Bools) -> None:
         frames = np.flatnonzero(marked)
         if len(frames):
-            known = self._spans[what]
-            self._spans[what] = [
-                known[0] if known[0] >= 0 else first + int(frames[0]),
+            span = self._spans[kind]
+            self._spans[kind] = [
+                span[0] if span[0] >= 0 else first + int(frames[0]),
                 first + int(frames[-1]),
             ]
-        if what == "repeated":
+        if kind == "repeated":
             self._repeated += len(frames)
         else:
             self._skipped += len(frames)
@@ -225,7 +225,7 @@ class _RepeatCheck:
     def close(self, shown: int) -> None:
         self._said.close()
         self._seen.close()
-        for what, count, text in (
+        for kind, count, text in (
             ("repeated", self._repeated, "are the one before again: no new one came in time"),
             (
                 "skipped",
@@ -236,9 +236,9 @@ class _RepeatCheck:
             share = count / shown if shown else 0.0
             if count:
                 many = share > self._settings.repeated_share
-                if what == "skipped" and not many:
+                if kind == "skipped" and not many:
                     continue  # single repeats prove nothing
-                first, last = self._spans[what]
+                first, last = self._spans[kind]
                 sentence = f"{count} of {shown} pictures of {self._camera} {text}"
                 severity: Severity = "warning" if many else "info"
                 bound = self._settings.repeated_share

@@ -82,8 +82,8 @@ def run_checks(source: EpisodeSource, settings: QualitySettings) -> Report:
 
 
 def _length(source: EpisodeSource, rows: int, settings: QualitySettings, flags: FlagCollector) -> None:
-    given = source.schema.get("min_length_s")
-    bound = float(given) if isinstance(given, int | float) and given >= 0 else settings.min_length_s
+    stated = source.schema.get("min_length_s")
+    bound = float(stated) if isinstance(stated, int | float) and stated >= 0 else settings.min_length_s
     seconds = rows / source.fps
     if not rows:
         flags.add(Flag("too_short", "error", -1, -1, "", "nothing was recorded: it has no rows", 0.0, bound))

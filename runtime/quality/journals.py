@@ -79,13 +79,13 @@ class JournalSource(EpisodeSource):
             remarks.append(
                 ("rows_cut", "warning", f"repair cut {cut} rows that had no picture of every camera")
             )
-        for camera, told in _table(outcome, "lost_cameras").items():
-            row = told.get("row") if isinstance(told, Mapping) else None
+        for camera, fields in _table(outcome, "lost_cameras").items():
+            row = fields.get("row") if isinstance(fields, Mapping) else None
             if isinstance(row, bool) or not isinstance(row, int) or row < 0:
-                text = f"{path}: lost_cameras.{camera} is {told!r}, must be a table with a row from 0"
+                text = f"{path}: lost_cameras.{camera} is {fields!r}, must be a table with a row from 0"
                 remarks.append(("unfinished", "error", text))
             else:
-                self.ends[camera] = VideoEnd(row, str(told.get("reason", "")))
+                self.ends[camera] = VideoEnd(row, str(fields.get("reason", "")))
         frames = outcome.get("frames")
         if isinstance(frames, bool) or not isinstance(frames, int) or frames < 0:
             remarks.append(
@@ -97,9 +97,9 @@ class JournalSource(EpisodeSource):
     def _vector(self, name: str) -> Vector:
         width = self._layout.width(name)
         names = self._robot.get("eef_names" if name.startswith("eef") else "joint_names")
-        told = tuple(map(str, names)) if isinstance(names, list) else ()
-        told = told if len(told) == width else tuple(f"number {k}" for k in range(width))
-        return Vector(width, told, _ROLES.get(name, "other"), name in _SPARSE)
+        labels = tuple(map(str, names)) if isinstance(names, list) else ()
+        labels = labels if len(labels) == width else tuple(f"number {k}" for k in range(width))
+        return Vector(width, labels, _ROLES.get(name, "other"), name in _SPARSE)
 
     def blocks(self) -> Iterator[Block]:
         path = self._folder / "rows.arrow"
@@ -126,7 +126,7 @@ class JournalSource(EpisodeSource):
 
     def _block(self, batch: Any, first: int) -> Block:
         layout = self._layout
-        known = set(batch.schema.names)
+        stored = set(batch.schema.names)
         return Block(
             first=first,
             rows=batch.num_rows,
@@ -140,10 +140,12 @@ class JournalSource(EpisodeSource):
             lost={
                 camera: marks(batch, f"lost.{camera}")
                 for camera in layout.cameras
-                if f"lost.{camera}" in known
+                if f"lost.{camera}" in stored
             },
-            simulated=np.array([one == "sim" for one in batch.column("control_source").to_pylist()], np.bool_)
-            if "control_source" in known
+            simulated=np.array(
+                [source == "sim" for source in batch.column("control_source").to_pylist()], np.bool_
+            )
+            if "control_source" in stored
             else None,
         )
 
@@ -186,14 +188,16 @@ def _next(batches: Any, path: Path, frames: int | None, first: int) -> Any:
         return None
 
 
-def _require(path: Path, given: Any, expected: Any) -> None:
+def _require(path: Path, actual: Any, expected: Any) -> None:
     """Check that each column of the manifest exists with its declared type. Raises RecordingError."""
     strange = [
-        f"{field.name} is {given.field(field.name).type if field.name in given.names else 'absent'}, "
+        f"{field.name} is {actual.field(field.name).type if field.name in actual.names else 'absent'}, "
         f"must be {field.type}"
         for field in expected
         if (
-            given.field(field.name).type != field.type if field.name in given.names else not added(field.name)
+            actual.field(field.name).type != field.type
+            if field.name in actual.names
+            else not added(field.name)
         )
     ]
     if strange:

@@ -35,12 +35,12 @@ class LostFrames:
         self._runs.close()
         if self._end is None:
             return
-        told = f"the video of {self._camera} ended: {self._end.reason}"
+        cause = f"the video of {self._camera} ended: {self._end.reason}"
         if self._end.row < rows:
-            text = f"from frame {self._end.row} on {told}"
+            text = f"from frame {self._end.row} on {cause}"
             self._flags.add(Flag("video_lost", "error", self._end.row, rows - 1, self._camera, text))
         else:
-            text = f"after the last frame {told}"
+            text = f"after the last frame {cause}"
             self._flags.add(Flag("video_lost", "warning", -1, -1, self._camera, text))
 
     def _lost(self, run: FrameRun) -> None:

@@ -61,12 +61,12 @@ class MotionCheck:
         state = _usable(block, self._state)
         moving = self._moving(state)
         some: Bools = np.asarray(moving.any(axis=1))
-        found = np.flatnonzero(some)
-        if len(found):
+        moving_rows = np.flatnonzero(some)
+        if len(moving_rows):
             self._first_motion = (
-                self._first_motion if self._first_motion >= 0 else block.first + int(found[0])
+                self._first_motion if self._first_motion >= 0 else block.first + int(moving_rows[0])
             )
-            self._last_motion = block.first + int(found[-1])
+            self._last_motion = block.first + int(moving_rows[-1])
         self._rows = block.first + block.rows
         with np.errstate(invalid="ignore"):
             self._beyond_limits(block.first, state)
@@ -128,14 +128,14 @@ class MotionCheck:
             return
         # Motion is detected as soon as positions differ, at most the lag after it began.
         head, tail = self._first_motion, last - self._last_motion
-        for kind, frames, first, bound, what in (
+        for kind, frames, first, bound, phase in (
             ("idle_head", head, 0, self._settings.idle_head_s, "before it moves"),
             ("idle_tail", tail, last - tail + 1, self._settings.idle_tail_s, "after it moved"),
         ):
             seconds = frames / self._fps
             if seconds > bound:
                 end = first + frames - 1
-                text = f"{frame_range(first, end)}: the robot stands for {seconds:.1f} s {what}"
+                text = f"{frame_range(first, end)}: the robot stands for {seconds:.1f} s {phase}"
                 self._flags.add(Flag(kind, "warning", first, end, self._state, text, seconds, bound))
 
     def _saturated(self, dim: int) -> Callable[[FrameRun], None]:
@@ -221,7 +221,7 @@ class _TrackingDelay:
 
     def _ended(self, run: FrameRun) -> None:
         dim = self._worst[run.at]
-        self._worst = {frame: other for frame, other in self._worst.items() if frame > run.last}
+        self._worst = {frame: run_at for frame, run_at in self._worst.items() if frame > run.last}
         text = (
             f"{frame_range(run.first, run.last)}: {self._joints.names[dim]} stays {run.value:.3f} away from what was "
             f"commanded, {self._settings.tracking_s:g} s long"
@@ -238,8 +238,8 @@ class _TrackingDelay:
 def _usable(block: Block, name: str) -> Float32:
     """Return the column `name` as an array, NaN for unknown values."""
     numbers = block.vectors[name]
-    known = ~(numbers.missing | numbers.malformed)
-    return np.where(known[:, None] & np.isfinite(numbers.values), numbers.values, np.nan).astype(np.float32)
+    valid = ~(numbers.missing | numbers.malformed)
+    return np.where(valid[:, None] & np.isfinite(numbers.values), numbers.values, np.nan).astype(np.float32)
 
 
 def _idle_speeds(joints: JointSpecs, settings: QualitySettings) -> Float64:

@@ -65,8 +65,8 @@ class Report:
     @property
     def worst(self) -> Severity | Literal[""]:
         """Highest severity, "" without flags."""
-        found = {flag.severity for flag in self.flags}
-        return next((severity for severity in reversed(SEVERITIES) if severity in found), "")
+        severities = {flag.severity for flag in self.flags}
+        return next((severity for severity in reversed(SEVERITIES) if severity in severities), "")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as JSON; numbers that are not finite become null."""
@@ -166,19 +166,19 @@ class RunCollector:
             self._add_run(FrameRun(first + int(part[0]), first + int(part[-1]), float(worst[at]), first + at))
 
     def _add_run(self, new: FrameRun) -> None:
-        known = self._open
-        if known is None or new.first - known.last > self._apart + 1:
+        current = self._open
+        if current is None or new.first - current.last > self._apart + 1:
             self.close()
             self._open = new
             return
-        worse = new if new.value > known.value else known
-        self._open = FrameRun(known.first, new.last, worse.value, worse.at)
+        worse = new if new.value > current.value else current
+        self._open = FrameRun(current.first, new.last, worse.value, worse.at)
 
     def close(self) -> None:
         """End the open run, because the episode has ended."""
         if self._open is not None:
-            known, self._open = self._open, None
-            self._ended(known)
+            current, self._open = self._open, None
+            self._ended(current)
 
 
 def frame_range(first: int, last: int) -> str:

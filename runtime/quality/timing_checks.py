@@ -19,8 +19,8 @@ class TimingCheck:
         self._source = source
         self._settings = settings
         self._flags = flags
-        given = source.schema.get("max_skew_s")
-        self._skew = float(given) if isinstance(given, int | float) and given > 0 else settings.max_skew_s
+        stated = source.schema.get("max_skew_s")
+        self._skew = float(stated) if isinstance(stated, int | float) and stated > 0 else settings.max_skew_s
         self._before: dict[str, float] = {}  # newest value of each clock and stream
         self._index: int | None = None
         self._runs: dict[tuple[str, str], RunCollector] = {}
@@ -53,7 +53,7 @@ class TimingCheck:
         for place in np.flatnonzero(steps != 1):
             frame = block.first + int(place)
             was = before if place == 0 else int(index[place - 1])
-            told = (
+            text = (
                 f"row {int(index[place])} follows row {was}"
                 if frame
                 else f"the first row is number {int(index[0])}"
@@ -63,7 +63,7 @@ class TimingCheck:
                 "error",
                 frame,
                 "",
-                f"{told}: rows are missing, or out of order",
+                f"{text}: rows are missing, or out of order",
                 float(steps[place]),
                 1.0,
             )
@@ -81,12 +81,12 @@ class TimingCheck:
 
         A negative step is flagged, and also a step of zero unless `again`.
         """
-        known = np.isfinite(times)
+        finite = np.isfinite(times)
         steps = np.full(len(times), np.nan)
-        told = times[known]
-        if len(told):
-            steps[known] = np.diff(np.concatenate([[self._before.get(name, np.nan)], told]))
-            self._before[name] = float(told[-1])
+        finite_times = times[finite]
+        if len(finite_times):
+            steps[finite] = np.diff(np.concatenate([[self._before.get(name, np.nan)], finite_times]))
+            self._before[name] = float(finite_times[-1])
         wrong = steps < 0 if again else steps <= 0
         self._mark("time_order", name, block, wrong, -steps)
         return steps
@@ -101,9 +101,9 @@ class TimingCheck:
 
     def _apart(self, block: Block) -> None:
         times = np.stack(list(block.captured.values()))
-        known = np.isfinite(times)
-        spread = np.where(known, times, -np.inf).max(axis=0) - np.where(known, times, np.inf).min(axis=0)
-        spread[known.sum(axis=0) < 2] = 0.0
+        finite = np.isfinite(times)
+        spread = np.where(finite, times, -np.inf).max(axis=0) - np.where(finite, times, np.inf).min(axis=0)
+        spread[finite.sum(axis=0) < 2] = 0.0
         self.largest_skew = max(self.largest_skew or 0.0, float(spread.max(initial=0.0)))
         self._mark("skew", "", block, spread > self._skew, spread)
 
@@ -131,7 +131,7 @@ class TimingCheck:
         where, value = frame_range(run.first, run.last), run.value
         settings = self._settings
         age = settings.joint_age_s if stream in JOINTS else settings.picture_age_s
-        said: dict[str, tuple[Severity, str, float | None, float | None]] = {
+        findings: dict[str, tuple[Severity, str, float | None, float | None]] = {
             "capture_unknown": ("info", f"{where}: the capture times of {stream} are unknown", None, None),
             "time_missing": ("error", f"{where}: {stream} is not a number", None, None),
             "time_order": ("error", f"{where}: {stream} does not go forwards, by {value:.4f} s", value, 0.0),
@@ -150,7 +150,7 @@ class TimingCheck:
             "skew": ("warning", f"{where}: streams captured up to {value:.3f} s apart", value, self._skew),
             "stale": ("warning", f"{where}: {stream} is up to {value:.3f} s old", value, age),
         }
-        severity, text, worst, bound = said[kind]
+        severity, text, worst, bound = findings[kind]
         self._flags.add(Flag(kind, severity, run.first, run.last, stream, text, worst, bound))
 
     def _flag(

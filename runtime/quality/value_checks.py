@@ -83,14 +83,14 @@ class _Column:
             return None
         if joints is None or len(joints.names) != width:
             return np.full(width, settings.joint_speed)
-        known = np.isfinite(joints.velocity)
-        bound = np.where(known, joints.velocity * settings.speed_factor, settings.joint_speed)
+        bounded = np.isfinite(joints.velocity)
+        bound = np.where(bounded, joints.velocity * settings.speed_factor, settings.joint_speed)
         return np.where(joints.position_mask, bound, np.inf)
 
     def add(self, first: int, numbers: VectorColumn) -> None:
         finite = np.isfinite(numbers.values)
-        there = ~(numbers.missing | numbers.malformed)
-        broken = there & ~finite.all(axis=1)
+        present = ~(numbers.missing | numbers.malformed)
+        broken = present & ~finite.all(axis=1)
         self._runs["missing"].add(first, numbers.missing)
         self._runs["dimensions"].add(first, numbers.malformed)
         if not broken.any():
@@ -98,7 +98,7 @@ class _Column:
         for row in np.flatnonzero(broken):  # rare, so one row at a time, to name the dimensions
             self._runs["not_finite"].add(first + int(row), np.ones(1, np.bool_))
             self._broken |= set(np.flatnonzero(~finite[row]).tolist())
-        usable = np.where(finite & there[:, None], numbers.values, np.nan).astype(np.float32)
+        usable = np.where(finite & present[:, None], numbers.values, np.nan).astype(np.float32)
         if self._vector.role == "poses":
             self._rotations(first, usable)
         if self._speeds is not None:
@@ -148,7 +148,7 @@ class _Column:
     def _jump(self, run: FrameRun) -> None:
         assert self._speeds is not None
         dim = self._worst[run.at]
-        self._worst = {frame: other for frame, other in self._worst.items() if frame > run.last}
+        self._worst = {frame: run_at for frame, run_at in self._worst.items() if frame > run.last}
         bound = float(self._speeds[dim])
         unit = "m/s" if self._vector.role == "poses" else "rad/s"
         text = f"{self.name}: {self._vector.names[dim]} jumps, at {run.value * bound:.2f} {unit}"
