@@ -12,8 +12,8 @@ from runtime.station.spec import StationSpec, build_spec
 
 def check_deployment(resolved: Resolved) -> StationSpec:
     """Check that the parts of a deployment fit each other. Raises ConfigurationError or SetupError."""
-    settings, made = resolved.deployment, build_spec(resolved)
-    robot = made.robot
+    settings, spec = resolved.deployment, build_spec(resolved)
+    robot = spec.robot
     if settings.setup.pose not in robot.poses:
         raise ConfigurationError(
             f"setup.pose = {settings.setup.pose!r}: {robot.name} has {', '.join(sorted(robot.poses))}"
@@ -22,37 +22,41 @@ def check_deployment(resolved: Resolved) -> StationSpec:
     if unknown:
         arms = ", ".join(arm.name for arm in robot.arms)
         raise ConfigurationError(f"safety.workspace.{min(unknown)}: {robot.name} has the arms {arms}")
-    if made.fps > made.rate:
+    if spec.fps > spec.rate:
         raise ConfigurationError(
-            f"recording.fps = {made.fps:g}: there would be more rows than ticks; "
-            f"allowed: at most {made.rate:g}, the control rate"
+            f"recording.fps = {spec.fps:g}: there would be more rows than ticks; "
+            f"allowed: at most {spec.rate:g}, the control rate"
         )
-    strange = [camera for camera in settings.recording.heights if camera not in made.cameras]
+    strange = [camera for camera in settings.recording.heights if camera not in spec.cameras]
     if strange:
         raise ConfigurationError(
             f"recording.heights: {', '.join(strange)} are no cameras of this station; "
-            f"allowed: {', '.join(made.cameras)}"
+            f"allowed: {', '.join(spec.cameras)}"
         )
     if settings.cameras:
         from runtime.cameras.attach import check
 
         check(settings.cameras, robot)
-    collection.check(settings.collection, made.cameras)
-    _check_publication(made)
-    _check_collection(made)
-    if settings.safety.report_only and made.capabilities.moves_robot:
+    collection.check(settings.collection, spec.cameras)
+    _check_publication(spec)
+    _check_collection(spec)
+    if settings.safety.report_only and spec.capabilities.moves_robot:
         raise SetupError(
             f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "
             "report-only is for transports that cannot (dataset)"
         )
-    return made
+    return spec
 
 
-def _check_collection(made: StationSpec) -> None:
+def _check_collection(spec: StationSpec) -> None:
     """Check that a node which drives by itself can be started and stopped by us, and reports its actions."""
-    wanted, capabilities = made.deployment.collection, made.capabilities
-    if wanted is not None and wanted.source == "node" and not capabilities.drives_itself:
-        kind = made.deployment.transport.kind
+    collection_settings, capabilities = spec.deployment.collection, spec.capabilities
+    if (
+        collection_settings is not None
+        and collection_settings.source == "node"
+        and not capabilities.drives_itself
+    ):
+        kind = spec.deployment.transport.kind
         leads = kind if kind in variants("runtime.teleoperators") else "zmq"
         raise SetupError(
             f'collection.source = "node" with transport {kind!r}, which can neither switch a robot\'s own leader on '
@@ -61,23 +65,23 @@ def _check_collection(made: StationSpec) -> None:
         )
 
 
-def _check_publication(made: StationSpec) -> None:
+def _check_publication(spec: StationSpec) -> None:
     """Check that the transport can publish the configured space and pose format."""
-    wanted, capabilities = made.deployment.publication, made.capabilities
-    kind = made.deployment.transport.kind
-    if wanted.space not in capabilities.spaces:
+    publication, capabilities = spec.deployment.publication, spec.capabilities
+    kind = spec.deployment.transport.kind
+    if publication.space not in capabilities.spaces:
         raise SetupError(
-            f"publication.space = {wanted.space!r} with transport {kind!r}, which has no such command; "
+            f"publication.space = {publication.space!r} with transport {kind!r}, which has no such command; "
             f"allowed: {', '.join(sorted(capabilities.spaces))}"
         )
-    if wanted.space == "joint":
-        reject_pose_format(wanted.pose, "publication.pose")
+    if publication.space == "joint":
+        reject_pose_format(publication.pose, "publication.pose")
         return
     from runtime.spaces.pose_rows import PoseRows
 
-    PoseRows(wanted.pose, made.robot, "publication.pose")
-    if capabilities.poses and wanted.pose not in capabilities.poses:
+    PoseRows(publication.pose, spec.robot, "publication.pose")
+    if capabilities.poses and publication.pose not in capabilities.poses:
         raise SetupError(
-            f"publication.pose = {wanted.pose} with transport {kind!r}; "
+            f"publication.pose = {publication.pose} with transport {kind!r}; "
             f"allowed: {'; '.join(map(str, capabilities.poses))}"
         )

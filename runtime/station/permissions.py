@@ -67,10 +67,10 @@ def require(command: Command, own: Resolved) -> None:
     table = command.args.get("policy")
     if isinstance(table, Mapping):
         try:
-            wanted = apply_changes(own, {"policy": table}, command.kind)
+            requested = apply_changes(own, {"policy": table}, command.kind)
         except ConfigurationError:  # reported when the command is executed, or in the preflight's report
             return
-        require_allowed_references(own.deployment, wanted.deployment)
+        require_allowed_references(own.deployment, requested.deployment)
 
 
 def require_allowed_references(own: Deployment, given: Deployment) -> None:
@@ -78,31 +78,31 @@ def require_allowed_references(own: Deployment, given: Deployment) -> None:
 
     Names in the deployment's own [policy] stay allowed.
     """
-    said = {(what, value) for _, what, value in find_host_references(own.policy)}
-    for key, what, value in find_host_references(given.policy):
-        if (what, value) not in said and not _is_allowed(own, what, value):
-            raise ConfigurationError(_NOT_ALLOWED(key=key, value=value, advice=_advice(own, what)))
+    stated = {(kind, value) for _, kind, value in find_host_references(own.policy)}
+    for key, kind, value in find_host_references(given.policy):
+        if (kind, value) not in stated and not _is_allowed(own, kind, value):
+            raise ConfigurationError(_NOT_ALLOWED(key=key, value=value, advice=_advice(own, kind)))
 
 
-def _is_allowed(own: Deployment, what: HostReference, value: str) -> bool:
-    if what is HostReference.VARIABLE:
+def _is_allowed(own: Deployment, kind: HostReference, value: str) -> bool:
+    if kind is HostReference.VARIABLE:
         return any(fnmatchcase(value, pattern) for pattern in own.security.variables)
-    if what is HostReference.RECORDING:
-        ours = _is_inside(value, _recordings(own)) and _is_recording(value)
-        return ours or _is_inside(value, own.security.files)
-    listed = own.security.files if what is HostReference.FILE else ()
+    if kind is HostReference.RECORDING:
+        own_recording = _is_inside(value, _recordings(own)) and _is_recording(value)
+        return own_recording or _is_inside(value, own.security.files)
+    listed = own.security.files if kind is HostReference.FILE else ()
     if value == "none":  # ssh without a configuration file
         return True
     return _is_inside(value, (own.ssh_dir, *listed))
 
 
-def _advice(own: Deployment, what: HostReference) -> str:
-    if what is HostReference.VARIABLE:
+def _advice(own: Deployment, kind: HostReference) -> str:
+    if kind is HostReference.VARIABLE:
         allowed = ", ".join(own.security.variables) or "none"
         return _VARIABLES_OF_WEB(allowed=allowed)
-    if what is HostReference.WRITTEN:
+    if kind is HostReference.WRITTEN:
         return _WRITTEN_FILES_OF_WEB(folder=own.ssh_dir)
-    if what is HostReference.RECORDING:
+    if kind is HostReference.RECORDING:
         return _RECORDINGS_OF_WEB(where=own.data, listed=_LISTED_FILES)
     return _FILES_OF_WEB(where=own.ssh_dir, listed=_LISTED_FILES)
 
@@ -128,7 +128,7 @@ def _is_inside(value: str, allowed: Iterable[str | Path]) -> bool:
     """
     try:
         path = _resolved(value)
-        return any(path.is_relative_to(_resolved(one)) for one in allowed)
+        return any(path.is_relative_to(_resolved(folder)) for folder in allowed)
     except (OSError, RuntimeError, ValueError):  # invalid path or circular links
         return False
 

@@ -134,13 +134,13 @@ class Preflights:
             flight.over.wait(2.0)
 
 
-def _deadline_for(resolved: Resolved, asked: PreflightRequest) -> float:
+def _deadline_for(resolved: Resolved, request: PreflightRequest) -> float:
     """Return the longest time for the policy [s]: the sum of its deadlines.
 
     For an invalid deployment it is a default; the preflight's process reports what is invalid.
     """
     try:
-        return default_deadline(apply_changes(resolved, asked.changes, "preflight").deployment)
+        return default_deadline(apply_changes(resolved, request.changes, "preflight").deployment)
     except RuntimeFault:
         return 30.0
 
@@ -171,40 +171,40 @@ def run_preflight(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
     return report
 
 
-def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
+def _supervise(flight: PreflightRun, request: Mapping[str, Any]) -> None:
     """Wait for the child and store its result; whatever happens, the preflight is over afterwards."""
     report: dict[str, Any] = {}
     failure: str = _UNREADABLE
     try:
-        report, failure = _child_result(flight.child, asked)
+        report, failure = _child_result(flight.child, request)
     finally:
         if not flight.failure:
             flight.finished, flight.failure = report, failure
         flight.over.set()
 
 
-def _child_result(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+def _child_result(child: subprocess.Popen[bytes], request: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     """Wait until the child has ended; return its report, and the reason if there is none."""
     assert child.stdin is not None
     assert child.stdout is not None
     with contextlib.suppress(BrokenPipeError):  # it ended without reading; the exit code is reported below
-        child.stdin.write(json.dumps(asked).encode() + b"\n")
+        child.stdin.write(json.dumps(request).encode() + b"\n")
         child.stdin.flush()
-    said = child.stdout.read()  # communicate() would close its standard input, which ends it
+    output = child.stdout.read()  # communicate() would close its standard input, which ends it
     code = child.wait()
     child.stdout.close()
     with contextlib.suppress(BrokenPipeError):  # likewise, for bytes that were still buffered
         child.stdin.close()
-    report = _report(said)
+    report = _report(output)
     return report, "" if report else _SAID_NOTHING(code=code)
 
 
-def _report(said: bytes) -> dict[str, Any]:
+def _report(output: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(said)
+        fields = json.loads(output)
     except ValueError:
         return {}
-    return dict(found) if isinstance(found, Mapping) else {}
+    return dict(fields) if isinstance(fields, Mapping) else {}
 
 
 def default_deadline(settings: Deployment) -> float:

@@ -46,8 +46,8 @@ def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
         raise ConfigurationError(str(error)) from None
     stored = _configuration(folder, manifest)
     source = f"the configuration of run {folder.name}"
-    wanted = _requested_settings(deepcopy(stored), manifest, data)
-    resolved = apply_assignments(wanted, {}, source, assignments)
+    requested = _requested_settings(deepcopy(stored), manifest, data)
+    resolved = apply_assignments(requested, {}, source, assignments)
     return Rerun(resolved, tuple(_lines(folder.name, manifest, stored, resolved)))
 
 
@@ -57,22 +57,22 @@ def find_episode(run: str, data: Path) -> Path:
     Raises ConfigurationError if there is none or several.
     """
     episodes = data / "episodes"
-    wanted = run.strip().lower()
-    if not wanted or not set(wanted) <= set("0123456789abcdef-"):
+    prefix = run.strip().lower()
+    if not prefix or not set(prefix) <= set("0123456789abcdef-"):
         raise ConfigurationError(f"--from-run {run!r}: must be the uuid of a run, or how it begins")
     if not episodes.is_dir():
         raise ConfigurationError(
             f"--from-run {run}: there are no episodes in {data}; name the data folder with --data-dir"
         )
-    found = sorted(path.name for path in episodes.glob(f"{wanted}*") if path.is_dir())
-    if not found:
+    matches = sorted(path.name for path in episodes.glob(f"{prefix}*") if path.is_dir())
+    if not matches:
         raise ConfigurationError(
             f"--from-run {run}: no episode in {episodes} begins so; name another data folder with --data-dir"
         )
-    if len(found) > 1 and wanted not in found:
-        named = ", ".join(found[:_LISTED]) + (", ..." if len(found) > _LISTED else "")
-        raise ConfigurationError(f"--from-run {run}: {len(found)} episodes begin so: {named}")
-    return episodes / (wanted if wanted in found else found[0])
+    if len(matches) > 1 and prefix not in matches:
+        named = ", ".join(matches[:_LISTED]) + (", ..." if len(matches) > _LISTED else "")
+        raise ConfigurationError(f"--from-run {run}: {len(matches)} episodes begin so: {named}")
+    return episodes / (prefix if prefix in matches else matches[0])
 
 
 def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,10 +83,10 @@ def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
         raise ConfigurationError(f"{path} has no configuration: that run cannot be started again")
     if not isinstance(digest, str) or not digest:
         raise ConfigurationError(f"{path} has no configuration_hash: its configuration cannot be verified")
-    found = config_digest(stored)
-    if found != digest:
+    actual = config_digest(stored)
+    if actual != digest:
         raise ConfigurationError(
-            f"{path}: configuration has the hash {_short(found)}, the run was made with {_short(digest)}: "
+            f"{path}: configuration has the hash {_short(actual)}, the run was made with {_short(digest)}: "
             "the manifest was altered since"
         )
     return stored
@@ -124,10 +124,14 @@ def _lines(run: str, then: Mapping[str, Any], stored: Mapping[str, Any], now: Re
 
 
 def _described(manifest: Mapping[str, Any]) -> str:
-    asked = manifest.get("asked_wall", manifest.get("started_wall"))
-    date = f"{datetime.fromtimestamp(asked):%Y-%m-%d %H:%M}" if isinstance(asked, int | float) else "no date"
-    told = (f"{key} {manifest[key]}" for key in ("station", "mode", "strategy") if manifest.get(key))
-    return ", ".join((date, *told, f"task {manifest.get('task', '')!r}"))
+    requested_wall = manifest.get("asked_wall", manifest.get("started_wall"))
+    date = (
+        f"{datetime.fromtimestamp(requested_wall):%Y-%m-%d %H:%M}"
+        if isinstance(requested_wall, int | float)
+        else "no date"
+    )
+    fields = (f"{key} {manifest[key]}" for key in ("station", "mode", "strategy") if manifest.get(key))
+    return ", ".join((date, *fields, f"task {manifest.get('task', '')!r}"))
 
 
 def _versions(then: object) -> str:
@@ -148,11 +152,11 @@ def _revisions(then: object) -> str:
     return f"the same, {now}" if certain and now != _UNKNOWN else f"{before} then, {now} now"
 
 
-def _revision(given: object) -> str:
+def _revision(value: object) -> str:
     """Return the short form of a revision; a revision with uncommitted changes never counts as equal to another."""
-    if not isinstance(given, Mapping) or not given.get("commit"):
+    if not isinstance(value, Mapping) or not value.get("commit"):
         return _UNKNOWN
-    return _short(str(given["commit"])) + (_DIRTY if given.get("dirty") else "")
+    return _short(str(value["commit"])) + (_DIRTY if value.get("dirty") else "")
 
 
 def _hashes(then: str, stored: Mapping[str, Any], now: Resolved) -> str:
@@ -170,13 +174,13 @@ def _hashes(then: str, stored: Mapping[str, Any], now: Resolved) -> str:
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return every setting of the nested tables by its full key."""
-    found: dict[str, Any] = {}
+    leaves: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:
-            found |= _leaves(value, f"{prefix}{key}.")
+            leaves |= _leaves(value, f"{prefix}{key}.")
         else:
-            found[f"{prefix}{key}"] = value
-    return found
+            leaves[f"{prefix}{key}"] = value
+    return leaves
 
 
 def _format_value(leaves: Mapping[str, Any], key: str) -> str:

@@ -114,12 +114,12 @@ class Run:
 
     def status(self, now: float) -> dict[str, Any]:
         """Return the run's number, uuid, executed and held time [s], and its limit [s]."""
-        held = self.held + (now - self.held_since if self.held_since is not None else 0.0)
+        held_s = self.held + (now - self.held_since if self.held_since is not None else 0.0)
         return {
             "number": self.number,
             "uuid": self.uuid,
             "elapsed": self.elapsed(now),
-            "held": held,
+            "held": held_s,
             "duration_s": self.duration_s,
         }
 

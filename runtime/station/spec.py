@@ -106,7 +106,7 @@ def build_spec(resolved: Resolved, capabilities: Capabilities | None = None) -> 
     settings = resolved.deployment
     try:
         grippers = {
-            name: robots.GripperChoice(**given.model_dump()) for name, given in settings.grippers.items()
+            name: robots.GripperChoice(**choice.model_dump()) for name, choice in settings.grippers.items()
         }
         robot = robots.load_robot(settings.robot, settings.groups, grippers)
     except robots.RobotError as error:
