@@ -13,8 +13,8 @@ import numpy as np
 
 def packed(value: object) -> bytes:
     """Pack a value as one message; an array becomes a map with four binary keys."""
-    made: bytes = msgpack.packb(value, default=_written)
-    return made
+    payload: bytes = msgpack.packb(value, default=_written)
+    return payload
 
 
 def unpacked(payload: bytes) -> Any:

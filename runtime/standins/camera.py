@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve a camera until SIGTERM, SIGINT or the end of the lifeline; return 0, or 2 if the port is in use."""
     options = parser().parse_args(arguments)
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     server = KINDS[options.kind](options.width, options.height, options.rate, options.port)
     server.fault = options.fault
     with contextlib.closing(server):
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"--port {options.port} cannot be taken: {error.strerror}", file=sys.stderr)
             return 2
         program.announce_ready({"kind": options.kind, "url": url}, options.ready_file)
-        told.wait()
+        stop.wait()
     return 0
 
 

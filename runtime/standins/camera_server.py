@@ -29,11 +29,11 @@ def picture(number: int, width: int, height: int) -> UInt8:
     """Return an RGB image [height, width, 3]: red on the left, blue on the right, with a white bar that grows per
     image.
     """
-    made = np.zeros((height, width, 3), np.uint8)
-    made[:, : width // 2, 0] = 220
-    made[:, width // 2 :, 2] = 220
-    made[-height // 8 :, : (number * 8) % width + 1] = 255
-    return made
+    image = np.zeros((height, width, 3), np.uint8)
+    image[:, : width // 2, 0] = 220
+    image[:, width // 2 :, 2] = 220
+    image[-height // 8 :, : (number * 8) % width + 1] = 255
+    return image
 
 
 class CameraServer(ABC):

@@ -69,9 +69,9 @@ class ModelSpace:
 
     def encode(self, joints: Float32) -> Float32:
         """Convert joint rows [H, D] to model rows [H, width]."""
-        made = np.zeros((len(joints), self.width), np.float32)
-        made[:, : joints.shape[1]] = (joints - self._centre) / self._half
-        return made
+        encoded = np.zeros((len(joints), self.width), np.float32)
+        encoded[:, : joints.shape[1]] = (joints - self._centre) / self._half
+        return encoded
 
     def joints(self, rows: ArrayLike) -> Float64:
         """Convert model rows to joint rows [H, D]; rows as wide as the joints are returned unchanged.
@@ -79,10 +79,10 @@ class ModelSpace:
         Raises:
             ValueError: If the rows have another width, or there are none.
         """
-        given = np.asarray(rows, np.float64)
+        chunk = np.asarray(rows, np.float64)
         dim = len(self._centre)
-        if given.ndim != 2 or not len(given) or given.shape[1] not in (dim, self.width):
+        if chunk.ndim != 2 or not len(chunk) or chunk.shape[1] not in (dim, self.width):
             raise ValueError(
-                f"the chunk before has shape {given.shape}, expected [T, {dim}] or [T, {self.width}]"
+                f"the chunk before has shape {chunk.shape}, expected [T, {dim}] or [T, {self.width}]"
             )
-        return given if given.shape[1] == dim else given[:, :dim] * self._half + self._centre
+        return chunk if chunk.shape[1] == dim else chunk[:, :dim] * self._half + self._centre

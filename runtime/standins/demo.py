@@ -69,11 +69,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--once", action="store_true", help="one episode, then end; else until Ctrl-C")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the run there")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, _interrupt)
     standins = StandIns()
     try:
-        return _demo(standins, given)
+        return _demo(standins, options)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         return 1
@@ -123,17 +123,17 @@ def run_station(option: str, assignments: Sequence[str]) -> tuple[int, dict[str,
         child.send_signal(signal.SIGINT)
         child.wait()
         raise
-    found: dict[str, Any] = json.loads(result.read_text("utf-8")) if result.exists() else {}
-    return code, found
+    outcome: dict[str, Any] = json.loads(result.read_text("utf-8")) if result.exists() else {}
+    return code, outcome
 
 
-def _demo(standins: StandIns, given: argparse.Namespace) -> int:
-    settings = deployment.load(_DEPLOYMENT, given.assignments).deployment
-    assignments = [*start_standins(standins, settings.robot), *given.assignments]
+def _demo(standins: StandIns, options: argparse.Namespace) -> int:
+    settings = deployment.load(_DEPLOYMENT, options.assignments).deployment
+    assignments = [*start_standins(standins, settings.robot), *options.assignments]
     code, result = run_station("--headless", assignments)
-    if given.json:
-        given.json.write_text(json.dumps(result or {"error": "no result"}, indent=1), "utf-8")
-    if code == 0 and not given.once:
+    if options.json:
+        options.json.write_text(json.dumps(result or {"error": "no result"}, indent=1), "utf-8")
+    if code == 0 and not options.once:
         ctl = f".venv/bin/python -m runtime.ctl --data-dir {settings.data} {settings.station}"
         print("\nThe station stays up; Ctrl-C here ends everything. Command it from a second terminal:")
         print(

@@ -66,8 +66,8 @@ class DroidRobot:
             (f"observation/exterior_image_{self._first + n}_left", key) for n, key in enumerate(self._above)
         ]
         pairs += [("observation/wrist_image_left", key) for key in self._wrists[:1]]
-        found = {key: message[name] for name, key in pairs if name in message}
-        return {key: picture if picture.ndim == 3 else picture[-1] for key, picture in found.items()}
+        available = {key: message[name] for name, key in pairs if name in message}
+        return {key: picture if picture.ndim == 3 else picture[-1] for key, picture in available.items()}
 
     def rows(self, targets: Float32, q: Float64) -> Float32:
         """Convert the script's targets [H, D], planned from joints `q` [D], to rows of this server."""

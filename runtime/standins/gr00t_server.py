@@ -92,22 +92,22 @@ class Gr00tServer:
         self._thread = None
 
     def _bound(self, patience: float = 0.0) -> zmq.Socket[bytes]:
-        made: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
-        made.setsockopt(zmq.LINGER, 0)
+        bound: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
+        bound.setsockopt(zmq.LINGER, 0)
         deadline = time.monotonic() + patience
         while True:
             try:
-                made.bind(f"tcp://127.0.0.1:{self._port or '*'}")
+                bound.bind(f"tcp://127.0.0.1:{self._port or '*'}")
                 break
             except zmq.ZMQError as error:
                 if time.monotonic() > deadline:
-                    made.close(linger=0)
+                    bound.close(linger=0)
                     raise SetupError(f"cannot listen at 127.0.0.1:{self._port}: {error}") from error
                 time.sleep(_SPELL_MS / 1e3)
-        address = made.getsockopt(zmq.LAST_ENDPOINT)
+        address = bound.getsockopt(zmq.LAST_ENDPOINT)
         assert isinstance(address, bytes)
         self._port = int(address.rstrip(b"\0").rpartition(b":")[2])
-        return made
+        return bound
 
     def _serve(self) -> None:
         while not self._ended.is_set():
@@ -171,10 +171,10 @@ class Gr00tServer:
         if behaviour.token and not hmac.compare_digest(str(message.get("api_token", "")), behaviour.token):
             return {"error": "Unauthorized: Invalid API token"}
         endpoint = message.get("endpoint", "get_action")
-        known = {"ping", "get_action", "get_modality_config"} | (
+        endpoints = {"ping", "get_action", "get_modality_config"} | (
             {"reset"} if behaviour.version != "n1.5" else set()
         )
-        if endpoint not in known or behaviour.fault.name == "unknown_endpoint":
+        if endpoint not in endpoints or behaviour.fault.name == "unknown_endpoint":
             return {"error": f"Unknown endpoint: {endpoint}"}
         if endpoint == "ping":
             return {"status": "ok", "message": "Server is running"}
@@ -192,11 +192,11 @@ class Gr00tServer:
         """
         groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
         actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
-        said: dict[str, object] = {"unnorm_key": "stand_in"}
+        contract: dict[str, object] = {"unnorm_key": "stand_in"}
         for name, widths in (("state", groups), ("action", actions)):
             prefixed = {f"{name}.{key}": width for key, width in widths.items()}
-            said |= {f"{name}_keys": list(prefixed), f"{name}_key_dims": prefixed}
-        return said
+            contract |= {f"{name}_keys": list(prefixed), f"{name}_key_dims": prefixed}
+        return contract
 
     def _modalities(self) -> dict[str, object]:
         cameras = [camera.key for camera in self._robot.cameras]
@@ -254,17 +254,17 @@ class Gr00tServer:
         lead = () if early else (1,)
         pictures = {}
         for camera in self._robot.cameras:
-            given = _value(observation, "video", camera.key, flat)
-            _require(given, "Video", camera.key, np.uint8, (*lead, len(self._behaviour.seen)), 3)
-            pictures[camera.key] = given.reshape(-1, *given.shape[-3:])[-1]
+            value = _value(observation, "video", camera.key, flat)
+            _require(value, "Video", camera.key, np.uint8, (*lead, len(self._behaviour.seen)), 3)
+            pictures[camera.key] = value.reshape(-1, *value.shape[-3:])[-1]
         joints = np.empty(self._robot.dim)
         for group in self._robot.groups:
-            given = _value(observation, "state", group.name, flat)
-            _require(given, "State", group.name, np.float32, (*lead, 1), 1)
-            joints[group.slice] = given.reshape(-1)
+            value = _value(observation, "state", group.name, flat)
+            _require(value, "State", group.name, np.float32, (*lead, 1), 1)
+            joints[group.slice] = value.reshape(-1)
         spoken = observation[LANGUAGE] if flat else observation["language"][LANGUAGE][0]
         assert isinstance(spoken, list), f"Language must be a list. Got {type(spoken)}"
-        assert all(isinstance(one, str) for one in spoken), f"Language must be text. Got {spoken}"
+        assert all(isinstance(text, str) for text in spoken), f"Language must be text. Got {spoken}"
         return pictures, joints, str(spoken[0])
 
     def _parts(self, rows: Float32) -> dict[str, Any]:
@@ -298,14 +298,14 @@ _RIGHT: tuple[bytes, ...] = ()
 
 
 def _value(observation: Mapping[str, Any], name: str, key: str, flat: bool) -> Any:
-    found, spoken = (observation, f"{name}.{key}") if flat else (observation[name], key)
-    assert spoken in found, f"{name.capitalize()} key '{spoken}' must be in observation"
-    return found[spoken]
+    parts, spoken = (observation, f"{name}.{key}") if flat else (observation[name], key)
+    assert spoken in parts, f"{name.capitalize()} key '{spoken}' must be in observation"
+    return parts[spoken]
 
 
-def _require(given: Any, name: str, key: str, dtype: Any, lead: tuple[int, ...], axes: int) -> None:
-    assert isinstance(given, np.ndarray), f"{name} key '{key}' must be a numpy array. Got {type(given)}"
-    assert given.dtype == dtype, f"{name} key '{key}' must be a numpy array of {dtype}. Got {given.dtype}"
+def _require(value: Any, name: str, key: str, dtype: Any, lead: tuple[int, ...], axes: int) -> None:
+    assert isinstance(value, np.ndarray), f"{name} key '{key}' must be a numpy array. Got {type(value)}"
+    assert value.dtype == dtype, f"{name} key '{key}' must be a numpy array of {dtype}. Got {value.dtype}"
     expected = (*lead, *("C" * axes))
-    shaped = given.ndim == len(expected) and given.shape[: len(lead)] == lead
-    assert shaped, f"{name} key '{key}' must have shape {expected}. Got {given.shape}"
+    shaped = value.ndim == len(expected) and value.shape[: len(lead)] == lead
+    assert shaped, f"{name} key '{key}' must have shape {expected}. Got {value.shape}"

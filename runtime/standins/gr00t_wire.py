@@ -19,8 +19,8 @@ class Pickled:
 def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
     """Pack one message; arrays as openpi does if `foreign`, as msgpack_numpy does if `modern` (N1.7), else as .npy."""
 
-    def written(given: object) -> object:
-        if isinstance(given, Pickled):
+    def written(item: object) -> object:
+        if isinstance(item, Pickled):
             pickled = {
                 b"nd": True,
                 b"type": "|O",
@@ -29,16 +29,16 @@ def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
                 b"data": b"\x80\x04]\x94N\x61.",
             }
             return pickled if modern else _file(np.array([None]), True)
-        assert isinstance(given, np.ndarray), f"a {type(given).__name__} cannot be packed"
-        name, shape, data = given.dtype.str, list(given.shape), given.tobytes()
+        assert isinstance(item, np.ndarray), f"a {type(item).__name__} cannot be packed"
+        name, shape, data = item.dtype.str, list(item.shape), item.tobytes()
         if foreign:
             return {b"__ndarray__": True, b"data": data, b"dtype": name, b"shape": shape}
         if modern:
             return {b"nd": True, b"type": name, b"kind": b"", b"shape": shape, b"data": data}
-        return _file(given)
+        return _file(item)
 
-    made: bytes = msgpack.packb(value, default=written)
-    return made
+    payload: bytes = msgpack.packb(value, default=written)
+    return payload
 
 
 def unpacked(payload: bytes, npy: bool = True, mnp: bool = True) -> Any:

@@ -122,18 +122,18 @@ class LerobotServer:
 
     def _instructed(self, request: Any, context: Any) -> Any:
         fault = self._behaviour.fault.name
-        told = wire.unpickle(
+        instructions = wire.unpickle(
             request.data, "lerobot.scripts.server.helpers" if fault == "no_name" else wire.HELPERS
         )
-        if told.policy_type not in _KINDS:
+        if instructions.policy_type not in _KINDS:
             raise ValueError(
-                f"Policy type {told.policy_type} not supported. Supported policies: {list(_KINDS)}"
+                f"Policy type {instructions.policy_type} not supported. Supported policies: {list(_KINDS)}"
             )
         if fault == "load_fails":
             raise FileNotFoundError(
-                f"{told.pretrained_name_or_path} is not a folder with a config.json (on purpose)"
+                f"{instructions.pretrained_name_or_path} is not a folder with a config.json (on purpose)"
             )
-        self._told, self._answer = told, self._script.begin()
+        self._told, self._answer = instructions, self._script.begin()
         self.loads += 1
         return wire.MESSAGES["Empty"]()
 

@@ -31,9 +31,9 @@ def _messages() -> dict[str, Any]:
         ("Actions", [("data", kinds.TYPE_BYTES)]),
         ("Empty", []),
     ):
-        made = file.message_type.add(name=name)
+        message_type = file.message_type.add(name=name)
         for number, (field, kind) in enumerate(fields, 1):
-            made.field.add(name=field, number=number, type=kind, label=kinds.LABEL_OPTIONAL)
+            message_type.field.add(name=field, number=number, type=kind, label=kinds.LABEL_OPTIONAL)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return {
@@ -119,13 +119,13 @@ def _storage(rows: Float32) -> bytes:
         "little_endian": True,
         "type_sizes": {"short": 2, "int": 4, "long": 4},
     }
-    said = (
+    storage = (
         b"\x80\x02(" + _text("storage") + _name("torch", "FloatStorage") + _text(_KEY) + _text("cpu")
         + _number(rows.size) + b"NtQ."
     )  # fmt: skip
     parts = [pickle.dumps(part, 2) for part in (_MAGIC, 1001, machine)]
     elements = np.ascontiguousarray(rows, "<f4").tobytes()
-    return b"".join([*parts, said, pickle.dumps([_KEY], 2), struct.pack("<q", rows.size), elements])
+    return b"".join([*parts, storage, pickle.dumps([_KEY], 2), struct.pack("<q", rows.size), elements])
 
 
 def _name(module: str, name: str) -> bytes:

@@ -92,13 +92,13 @@ def station(
     Raises:
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
-    made = check_deployment(loader.load(path, assignments))
-    given = ("--robot", made.robot.name, "--bench", "tabletop", *bench_options)
-    options = node_parser().parse_args(given)
-    around = environments.make_environment(made.robot, options)
-    peers = in_process_peers(made, clock, around, options)
+    spec = check_deployment(loader.load(path, assignments))
+    arguments = ("--robot", spec.robot.name, "--bench", "tabletop", *bench_options)
+    options = node_parser().parse_args(arguments)
+    around = environments.make_environment(spec.robot, options)
+    peers = in_process_peers(spec, clock, around, options)
     over = (lambda running: "") if paced else SuccessDetector(around.truth, clock)
-    return ServedLockstep(made, clock, over, peers=peers, paced=paced)
+    return ServedLockstep(spec, clock, over, peers=peers, paced=paced)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -131,15 +131,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Serve the station until SIGTERM, SIGINT or the end of the lifeline."""
     options = parser().parse_args(arguments)
     log.configure_logging("lockstep")
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     clock = VirtualClock()
     try:
         with ExitStack() as stack:
             urls: dict[str, str] = {}
             for line in options.serve:
-                given = serve.parser().parse_args(shlex.split(line))
-                server = stack.enter_context(closing(serve.build_server(given, clock)))
-                urls[str(given.name or len(urls))] = str(server.start()["url"])
+                server_options = serve.parser().parse_args(shlex.split(line))
+                server = stack.enter_context(closing(serve.build_server(server_options, clock)))
+                urls[str(server_options.name or len(urls))] = str(server.start()["url"])
             own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
             bench = ("--seed", options.seed, "--width", options.width, "--height", options.height)
             served = station(
@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             stack.enter_context(closing(served))
             program.announce_ready({"policies": urls}, options.ready_file)
-            served.serve(told.is_set)
+            served.serve(stop.is_set)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -53,8 +53,8 @@ class MjpegServer(CameraServer):
             jpeg = simplejpeg.encode_jpeg(picture(number, *self.size), quality=90)
             if self.fault in ("nonsense", "png"):
                 jpeg = bytes(reversed(jpeg))
-            told = ("Content-Type: image/png",) if self.fault == "png" else self.headers
-            lines = "".join(f"{line}\r\n" for line in ("--eva", *told, ""))
+            headers = ("Content-Type: image/png",) if self.fault == "png" else self.headers
+            lines = "".join(f"{line}\r\n" for line in ("--eva", *headers, ""))
             part = lines.format(length=len(jpeg)).encode()
             if self.fault == "torn":
                 client.sendall(part + jpeg[: len(jpeg) // 2])

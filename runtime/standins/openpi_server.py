@@ -88,16 +88,16 @@ class OpenpiServer(WebsocketServer):
         """Return the frame that answers a request. Raises an exception if the request cannot be answered."""
         if isinstance(request, str):
             raise TypeError("the request is a text frame; expected a binary one")
-        asked = self._wire.read(unpacked(request))
-        return self._wire.answer(self._result(answer, asked, previous_ms), asked)
+        parsed = self._wire.read(unpacked(request))
+        return self._wire.answer(self._result(answer, parsed, previous_ms), parsed)
 
-    def _result(self, answer: Answer, asked: ParsedRequest, previous_ms: float | None) -> dict[str, object]:
+    def _result(self, answer: Answer, request: ParsedRequest, previous_ms: float | None) -> dict[str, object]:
         started = time.monotonic()
-        observation = asked.observation
+        observation = request.observation
         state, pictures = self._state(observation), self._pictures(observation)
         actions = answer(state, pictures, str(observation.get("prompt", "")))
-        if asked.prefix is not None:
-            actions = continue_prefix(actions, asked.prefix, self._robot.binary_dims)
+        if request.prefix is not None:
+            actions = continue_prefix(actions, request.prefix, self._robot.binary_dims)
         took = 1e3 * self._took(started)
         timing = {} if self._behaviour.declared else {"infer_ms": took}  # a declared duration is not measured
         timing |= {} if previous_ms is None else {"prev_total_ms": previous_ms}

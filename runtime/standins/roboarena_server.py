@@ -77,9 +77,9 @@ class RoboarenaServer(WebsocketServer):
 
     def start(self) -> dict[str, object]:
         """Listen; return the address, with a path for vLLM-Omni."""
-        found = super().start()
+        address = super().start()
         path = VLLM_PATH if self._arena.variant == "vllm" else ""
-        return found | {"url": f"{found['url']}{path}"}
+        return address | {"url": f"{address['url']}{path}"}
 
     def serves_path(self, path: str) -> bool:
         """Return True if a policy is served at this path: at any path as RoboArena, at a single path as vLLM-Omni."""
@@ -118,8 +118,8 @@ class RoboarenaServer(WebsocketServer):
         """
         if self._arena.variant == "roboarena":
             return super().failed(connection, error, request)
-        known = "Invalid request payload" if isinstance(error, ValueError) else "Internal inference error"
-        connection.send(packed({"type": "error", "message": known}))
+        message = "Invalid request payload" if isinstance(error, ValueError) else "Internal inference error"
+        connection.send(packed({"type": "error", "message": message}))
         return True
 
     def _reply(self, answer: Answer, request: str | bytes) -> Frames:
@@ -134,8 +134,8 @@ class RoboarenaServer(WebsocketServer):
         self.heard.calls.append((endpoint, session))
         if endpoint == "reset":
             self.heard.frames.pop(session, None)
-            done = "done" if self._arena.fault.name == "reset_text" else "reset successful"
-            return packed({"status": done}) if vllm else done
+            text = "done" if self._arena.fault.name == "reset_text" else "reset successful"
+            return packed({"status": text}) if vllm else text
         return packed(self._formed(self._inferred(answer, message, session)))
 
     def _inferred(self, answer: Answer, message: dict[str, Any], session: str | None) -> Any:
@@ -164,10 +164,10 @@ class RoboarenaServer(WebsocketServer):
         names += ["wrist_image"] if arena.wrist else []
         sides = ("left", "right") if arena.stereo else ("left",)
         expected = {f"observation/{name}_{side}" for name in names for side in sides}
-        given = {key for key in message if "image" in key}
-        if given != expected:
-            raise KeyError(f"pictures {sorted(given)}; wanted {sorted(expected)}")
-        for key in given:
+        pictures = {key for key in message if "image" in key}
+        if pictures != expected:
+            raise KeyError(f"pictures {sorted(pictures)}; wanted {sorted(expected)}")
+        for key in pictures:
             picture = message[key]
             if picture.dtype != np.uint8 or picture.ndim not in (3, 4) or picture.shape[-1] != 3:
                 raise TypeError(f"{key} is {picture.dtype} {picture.shape}; expected uint8 [H, W, 3]")

@@ -155,9 +155,11 @@ class Envelope(Wire):
         }
 
     def read(self, message: Any) -> ParsedRequest:
-        found = (message.get("protocol"), message.get("protocol_version"))
-        if found != (_ENVELOPE, _VERSION):
-            raise ValueError(f"protocol {found[0]!r} version {found[1]!r}; expected {_ENVELOPE!r} version 2")
+        version = (message.get("protocol"), message.get("protocol_version"))
+        if version != (_ENVELOPE, _VERSION):
+            raise ValueError(
+                f"protocol {version[0]!r} version {version[1]!r}; expected {_ENVELOPE!r} version 2"
+            )
         number, codec = message.get("request_id"), message["image_transport"]["codec"]
         if not isinstance(number, int) or number < 0:
             raise ValueError(f"request_id is {number!r}, expected 0 or more")
@@ -177,8 +179,8 @@ class Envelope(Wire):
 
     def failure(self, traceback: str, message: Any) -> str | bytes:
         number = message.get("request_id") if isinstance(message, dict) else None
-        known = number if isinstance(number, int) else None
-        return packed({**self._head(), "request_id": known, "error": traceback})
+        request_id = number if isinstance(number, int) else None
+        return packed({**self._head(), "request_id": request_id, "error": traceback})
 
     def _head(self) -> dict[str, object]:
         version = _VERSION

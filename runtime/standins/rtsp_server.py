@@ -132,8 +132,8 @@ def _payloads(unit: bytes, last: bool) -> Iterator[tuple[bytes, bool]]:
     if len(unit) <= _LARGEST:
         yield unit, last
         return
-    kind, rest = unit[0], unit[1:]
-    pieces = [rest[at : at + _LARGEST] for at in range(0, len(rest), _LARGEST)]
+    kind, content = unit[0], unit[1:]
+    pieces = [content[at : at + _LARGEST] for at in range(0, len(content), _LARGEST)]
     for index, piece in enumerate(pieces):
         begins, ends = index == 0, index == len(pieces) - 1
         yield bytes([kind & 0x60 | 28, begins << 7 | ends << 6 | kind & 0x1F]) + piece, last and ends

@@ -110,11 +110,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     import robots
 
     options = parser().parse_args(arguments)
-    told = program.stop_event(options.lifeline)
+    stop = program.stop_event(options.lifeline)
     try:
         with contextlib.closing(build_server(options)) as server:
             program.announce_ready(server.start(), options.ready_file)
-            told.wait()
+            stop.wait()
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -143,10 +143,10 @@ class StarvlaServer(WebsocketServer):
         if normalized:
             rows = (2 * (rows - self.low) / (self.high - self.low) - 1).astype(np.float32)
         well = fault.name in ("none", "normalized")
-        made = apply_fault(fault, rows if normalized or not well else rows.astype(np.float64))
-        plain = isinstance(made, np.ndarray) and made.ndim == 2 and well
+        data = apply_fault(fault, rows if normalized or not well else rows.astype(np.float64))
+        plain = isinstance(data, np.ndarray) and data.ndim == 2 and well
         name = "normalized_actions" if normalized else "actions"
-        return {name: made[None] if plain and self._star.batched else made}
+        return {name: data[None] if plain and self._star.batched else data}
 
 
 def _binary(request: str | bytes) -> bytes:
