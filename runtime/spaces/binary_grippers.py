@@ -53,14 +53,14 @@ class BinaryGripper:
 
 def binary_grippers_of(robot: Robot) -> tuple[BinaryGripper, ...]:
     """Return the binary grippers of a robot."""
-    made = []
+    grippers = []
     for group in robot.groups:
         gripper, dim = group.gripper, group.gripper_dim
         if gripper is None or dim is None or gripper.threshold is None or gripper.hysteresis is None:
             continue
         width = gripper.hysteresis * abs(gripper.open - gripper.close)
-        made.append(BinaryGripper(dim, gripper.open, gripper.close, gripper.threshold, width))
-    return tuple(made)
+        grippers.append(BinaryGripper(dim, gripper.open, gripper.close, gripper.threshold, width))
+    return tuple(grippers)
 
 
 def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commanded: Float64) -> Float64:
@@ -71,7 +71,7 @@ def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commande
     if action.shape != commanded.shape:
         return action
     numbers = [switch for switch in switches if np.isfinite(action[switch.dim])]
-    ends = {one.dim: one.snap(action[one.dim], commanded[one.dim]) for one in numbers}
+    ends = {number.dim: number.snap(action[number.dim], commanded[number.dim]) for number in numbers}
     if all(action[dim] == end for dim, end in ends.items()):
         return action
     action = action.copy()
@@ -98,15 +98,15 @@ class Dwell:
         early = now - self._switched < MIN_SWITCH_INTERVAL_S - _EARLY_S
         if not early.any() or action.shape != commanded.shape:
             return action, ()
-        kept = early & self._switches(action, commanded)
-        if not kept.any():
+        dwelling = early & self._switches(action, commanded)
+        if not dwelling.any():
             return action, ()
         notes = tuple(
             f"{self._names[i]} kept at {round(float(commanded[i]), 4):g}: it switches once per "
             f"{MIN_SWITCH_INTERVAL_S:g} s at most"
-            for i in np.flatnonzero(kept)
+            for i in np.flatnonzero(dwelling)
         )
-        return np.where(kept, commanded, action), notes
+        return np.where(dwelling, commanded, action), notes
 
     def record_command(self, before: Float64, now_sent: Float64, now: float) -> None:
         """Record that `now_sent` [D] was sent after `before` [D]; grippers that switched are held from the time `now`

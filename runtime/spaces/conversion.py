@@ -110,15 +110,15 @@ class ActionSpaces(EndEffectors):
         if chunk.space == "joint":
             rows = self._check_rows(chunk, rate, self._robot.dim, self._robot.joint_names)
             rows = self._absolute_joints(rows, chunk, qpos, self._all)
-            held = self._snap_grippers(rows, {int(dim): int(dim) for dim in self._all}, onset, rate)
-            rows, source = resample(rows, rate, self._control_rate, held)
+            snapped = self._snap_grippers(rows, {int(dim): int(dim) for dim in self._all}, onset, rate)
+            rows, source = resample(rows, rate, self._control_rate, snapped)
             return CommandRows(rows, source, None)
         layout = self._layout_of(chunk.pose)
         rows = self._check_rows(chunk, rate, layout.width, layout.names)
         rows = self._absolute_poses(rows, layout, chunk, observation)
         following = {int(dim): self._count * EEF_WIDTH + place for place, dim in enumerate(layout.dims)}
-        held = self._snap_grippers(rows, self._gripper_columns | following, onset, rate)
-        rows, source = resample(rows, rate, self._control_rate, held, self._quaternions)
+        snapped = self._snap_grippers(rows, self._gripper_columns | following, onset, rate)
+        rows, source = resample(rows, rate, self._control_rate, snapped, self._quaternions)
         onset = self._unwrap_start(onset, qpos)
         return self._solved(rows, source, layout, qpos, onset)
 
@@ -131,13 +131,13 @@ class ActionSpaces(EndEffectors):
         because that row follows the present command and not the rows before it.
         """
         first = int(onset.first_row * rate / self._control_rate + 1e-9)
-        found = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
-        for switch, column in found:
+        snapped = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
+        for switch, column in snapped:
             for part in (slice(0, first), slice(first, None)):
                 rows[part, column] = switch.snap_sequence(
                     rows[part, column], float(onset.commanded[switch.dim])
                 )
-        return [column for _, column in found]
+        return [column for _, column in snapped]
 
     def pose_mismatch(self, measured: ArrayLike, q: ArrayLike) -> str:
         """Describe how much measured poses [8 * arms] differ from those of joints `q` [D], for the worst arm; "" if
@@ -145,10 +145,10 @@ class ActionSpaces(EndEffectors):
         """
         joints = np.asarray(q, dtype=np.float64)
         expected = self.vectors(joints)
-        given = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)
-        given = self._layout_of(None).normalize_quaternions(given[None])[0]
-        metres = np.linalg.norm(given[:, :3] - expected[:, :3], axis=-1)
-        cosines = np.abs(np.sum(given[:, 3:7] * expected[:, 3:7], axis=-1))
+        poses = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)
+        poses = self._layout_of(None).normalize_quaternions(poses[None])[0]
+        metres = np.linalg.norm(poses[:, :3] - expected[:, :3], axis=-1)
+        cosines = np.abs(np.sum(poses[:, 3:7] * expected[:, 3:7], axis=-1))
         degrees = np.degrees(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)))
         worst = int(np.argmax(metres / _SAME_PLACE + degrees / _SAME_TURN))
         if metres[worst] <= _SAME_PLACE and degrees[worst] <= _SAME_TURN:
@@ -162,9 +162,9 @@ class ActionSpaces(EndEffectors):
 
     def _layout_of(self, pose: PoseFormat | None) -> PoseRows:
         """Return the row layout of a pose format; the last layout is cached, because a policy uses a single format."""
-        wanted = CANONICAL if pose is None else pose
-        if self._layout is None or self._layout.pose != wanted:
-            self._layout = PoseRows(wanted, self._robot, "the policy's pose format")
+        requested = CANONICAL if pose is None else pose
+        if self._layout is None or self._layout.pose != requested:
+            self._layout = PoseRows(requested, self._robot, "the policy's pose format")
         return self._layout
 
     def _absolute_joints(
@@ -201,17 +201,17 @@ class ActionSpaces(EndEffectors):
 
     def _reference_vectors(self, layout: PoseRows, chunk: ActionChunk, observation: Observation) -> Float64:
         """Return the vectors [1, arms, 8] to which a chunk is relative."""
-        seen = self.eef_of(observation.qpos) if observation.eef is None else observation.eef
-        vectors = np.asarray(seen, dtype=np.float64).reshape(1, self._count, EEF_WIDTH)
+        eef = self.eef_of(observation.qpos) if observation.eef is None else observation.eef
+        vectors = np.asarray(eef, dtype=np.float64).reshape(1, self._count, EEF_WIDTH)
         return layout.normalize_quaternions(vectors, f"the chunk is {chunk.mode} to an observation with")
 
     def _with_joints(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
         """Return `qpos` [D] repeated for each row, with its values replaced by `joints` that follow the poses:
         [H, D].
         """
-        made = np.tile(qpos, (len(joints), 1))
-        made[:, layout.dims] = joints
-        return made
+        full = np.tile(qpos, (len(joints), 1))
+        full[:, layout.dims] = joints
+        return full
 
     def _solved(
         self, rows: Float64, source: NDArray[np.int64], layout: PoseRows, qpos: Float64, onset: ChunkStart
@@ -262,25 +262,25 @@ class ActionSpaces(EndEffectors):
         If the rows move the carrier, each pose is moved in the opposite way, so that the solved joints are right when
         the carrier has moved.
         """
-        made = poses
+        compensated = poses
         for index, arm in enumerate(self._robot.arms):
             if arm.carrier is None or not np.isin(arm.carrier_dims, layout.dims).any():
                 continue
-            there = arm.carried(self._with_joints(qpos, layout, joints))
-            wanted = arm.carried(qpos) @ np.linalg.inv(there) @ transform_of(poses[:, index])
-            made = made.copy() if made is poses else made
-            made[:, index, :3] = wanted[..., :3, 3]
-            made[:, index, 3:] = quaternion_of_matrix(wanted[..., :3, :3])
-        return made
+            carrier = arm.carried(self._with_joints(qpos, layout, joints))
+            target = arm.carried(qpos) @ np.linalg.inv(carrier) @ transform_of(poses[:, index])
+            compensated = compensated.copy() if compensated is poses else compensated
+            compensated[:, index, :3] = target[..., :3, 3]
+            compensated[:, index, 3:] = quaternion_of_matrix(target[..., :3, :3])
+        return compensated
 
     def _unwrap_start(self, onset: ChunkStart, qpos: Float64) -> ChunkStart:
         """Return `onset` with joints without limits shifted by whole turns to within half a turn of `qpos`."""
 
         def on_branch(joints: Float64) -> Float64:
-            made = np.array(joints, dtype=np.float64)
-            apart = made[self._wrapping] - qpos[self._wrapping]
-            made[self._wrapping] -= 2 * np.pi * np.round(apart / (2 * np.pi))
-            return made
+            unwrapped = np.array(joints, dtype=np.float64)
+            apart = unwrapped[self._wrapping] - qpos[self._wrapping]
+            unwrapped[self._wrapping] -= 2 * np.pi * np.round(apart / (2 * np.pi))
+            return unwrapped
 
         return ChunkStart(on_branch(onset.commanded), on_branch(onset.previous_command), onset.first_row)
 
@@ -311,9 +311,9 @@ class ActionSpaces(EndEffectors):
         return rows
 
 
-def _check_length(count: int, made: int) -> None:
-    if max(count, made) > _LONGEST:
-        at_rate = "" if made <= count else f", {made} at control rate"
+def _check_length(count: int, resampled: int) -> None:
+    if max(count, resampled) > _LONGEST:
+        at_rate = "" if resampled <= count else f", {resampled} at control rate"
         raise ShapeError(
             f"the policy answered with {count} rows{at_rate}; allowed: at most {_LONGEST} in one chunk"
         )

@@ -47,10 +47,12 @@ class Frame:
         if self.own:
             return vectors
         turn, shift = self._relation(joints)
-        made = vectors.copy()
-        made[..., _POSITION] = _turned(turn, vectors[..., _POSITION]) + shift
-        made[..., _QUATERNION] = quaternion_product(quaternion_of_matrix(turn), vectors[..., _QUATERNION])
-        return made
+        expressed = vectors.copy()
+        expressed[..., _POSITION] = _turned(turn, vectors[..., _POSITION]) + shift
+        expressed[..., _QUATERNION] = quaternion_product(
+            quaternion_of_matrix(turn), vectors[..., _QUATERNION]
+        )
+        return expressed
 
     def resolve(self, vectors: Float64, joints: Float64) -> Float64:
         """Transform vectors from this frame to each arm's own frame; the inverse of `express`."""
@@ -58,10 +60,10 @@ class Frame:
             return vectors
         turn, shift = self._relation(joints)
         back = np.swapaxes(turn, -1, -2)
-        made = vectors.copy()
-        made[..., _POSITION] = _turned(back, vectors[..., _POSITION] - shift)
-        made[..., _QUATERNION] = quaternion_product(quaternion_of_matrix(back), vectors[..., _QUATERNION])
-        return made
+        resolved = vectors.copy()
+        resolved[..., _POSITION] = _turned(back, vectors[..., _POSITION] - shift)
+        resolved[..., _QUATERNION] = quaternion_product(quaternion_of_matrix(back), vectors[..., _QUATERNION])
+        return resolved
 
     def _relation(self, joints: Float64) -> tuple[Float64, Float64]:
         """Return the pose of each arm's frame in this frame: rotations [T or 1, arms, 3, 3], positions [T or 1, arms,

@@ -150,14 +150,17 @@ class EulerAngles(Orientation):
         total = np.where(along <= _LOCKED, third - apart, total)
         apart = np.where(across <= _LOCKED, third - total, apart)
         middle = 2.0 * np.arctan2(across, along) - (0.0 if self._proper else np.pi / 2)
-        made = np.stack([total - apart, middle, self._raw(total + apart)], axis=-1)
+        angles = np.stack([total - apart, middle, self._raw(total + apart)], axis=-1)
         if before is None:
-            return _in_one_turn(made)
-        other = made + np.pi
-        other[:, 1] = -middle if self._proper else np.pi - middle
-        made, other = before + _in_one_turn(made - before), before + _in_one_turn(other - before)
-        nearer = np.abs(other - before).max(axis=-1) < np.abs(made - before).max(axis=-1) - 1e-9
-        return np.where(nearer[:, None], other, made)
+            return _in_one_turn(angles)
+        alternative = angles + np.pi
+        alternative[:, 1] = -middle if self._proper else np.pi - middle
+        angles, alternative = (
+            before + _in_one_turn(angles - before),
+            before + _in_one_turn(alternative - before),
+        )
+        nearer = np.abs(alternative - before).max(axis=-1) < np.abs(angles - before).max(axis=-1) - 1e-9
+        return np.where(nearer[:, None], alternative, angles)
 
     def _raw(self, third: Float64) -> Float64:
         return third if self._proper else third * self._sign
@@ -188,8 +191,8 @@ class SixD(Orientation):
     def decode(self, numbers: Float64) -> tuple[Float64, Bools]:
         first, straight = _directions(numbers[..., :3], [1.0, 0.0, 0.0])
         second = numbers[..., 3:]
-        rest = second - np.sum(first * second, axis=-1, keepdims=True) * first
-        second, apart = _directions(rest, [0.0, 1.0, 0.0])
+        orthogonal = second - np.sum(first * second, axis=-1, keepdims=True) * first
+        second, apart = _directions(orthogonal, [0.0, 1.0, 0.0])
         determined = straight & apart
         matrices = np.stack([first, second, np.cross(first, second)], axis=-1 if self._columns else -2)
         matrices[~determined] = np.eye(3)
@@ -207,17 +210,17 @@ def continuous_signs(quaternions: Float64) -> Float64:
 def _normalised(quaternions: Float64) -> tuple[Float64, Bools]:
     lengths = np.linalg.norm(quaternions, axis=-1)
     determined = lengths >= SHORTEST
-    made = quaternions / np.where(determined, lengths, 1.0)[..., None]
-    made[~determined] = [1.0, 0.0, 0.0, 0.0]
-    return made, determined
+    units = quaternions / np.where(determined, lengths, 1.0)[..., None]
+    units[~determined] = [1.0, 0.0, 0.0, 0.0]
+    return units, determined
 
 
 def _directions(vectors: Float64, otherwise: list[float]) -> tuple[Float64, Bools]:
     lengths = np.linalg.norm(vectors, axis=-1)
     determined = lengths >= SHORTEST
-    made = vectors / np.where(determined, lengths, 1.0)[..., None]
-    made[~determined] = otherwise
-    return made, determined
+    directions = vectors / np.where(determined, lengths, 1.0)[..., None]
+    directions[~determined] = otherwise
+    return directions, determined
 
 
 def _nearest_turns(before: Float64, axis: Float64, angle: Float64) -> Float64:
@@ -229,9 +232,9 @@ def _nearest_turns(before: Float64, axis: Float64, angle: Float64) -> Float64:
     along = np.sum(before * axis, axis=-1, keepdims=True)
     length = np.linalg.norm(before, axis=-1, keepdims=True)
     none = ~axis.any(axis=-1, keepdims=True)
-    way = np.where(none, before / np.where(length > _NO_AXIS, length, 1.0), axis)
+    direction = np.where(none, before / np.where(length > _NO_AXIS, length, 1.0), axis)
     turns = np.round(np.where(none, length, along - angle) / _WHOLE)
-    return np.asarray(way * turns * _WHOLE)
+    return np.asarray(direction * turns * _WHOLE)
 
 
 def _in_one_turn(angles: Float64) -> Float64:

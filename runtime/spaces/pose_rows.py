@@ -116,8 +116,8 @@ class PoseRows:
         before = self._poses_of(np.atleast_2d(previous))[..., self._turning]
         if previous.ndim == 1:
             return self._numbers.encode(quaternions, before[0])
-        each = self._numbers.encode(quaternions.reshape(1, -1, 4), before.reshape(-1, before.shape[-1]))
-        return each.reshape(before.shape)
+        encoded = self._numbers.encode(quaternions.reshape(1, -1, 4), before.reshape(-1, before.shape[-1]))
+        return encoded.reshape(before.shape)
 
     def decode(self, rows: Float64, whose: str = "the policy answered with") -> tuple[Float64, Float64]:
         """Return vectors [T, arms, 8] in the declared frame and the joints [T, n] that follow, from rows [T, width].
@@ -130,9 +130,9 @@ class PoseRows:
         poses = self._poses_of(rows)
         vectors = np.zeros((len(rows), len(self._arms), EEF_WIDTH))
         vectors[..., _POSITION] = poses[..., _POSITION]
-        given = poses[..., self._turning]
-        quaternions, determined = self._numbers.decode(given)
-        self._require(determined, given, whose)
+        numbers = poses[..., self._turning]
+        quaternions, determined = self._numbers.decode(numbers)
+        self._require(determined, numbers, whose)
         vectors[..., _QUATERNION] = continuous_quaternions(quaternions)
         if self.pose.gripper:
             vectors[..., _GRIPPER] = np.where(self._gripped, poses[..., -1], 0.0)
@@ -148,40 +148,41 @@ class PoseRows:
             PolicyError: A quaternion is nearly zero or not a number; the message begins with `whose`.
         """
         codec = QuaternionOrientation(scalar_first=True)
-        made = vectors.copy()
-        made[..., _QUATERNION], determined = codec.decode(vectors[..., _QUATERNION])
+        normalized = vectors.copy()
+        normalized[..., _QUATERNION], determined = codec.decode(vectors[..., _QUATERNION])
         self._require(determined, vectors[..., _QUATERNION], whose, codec)
-        return made
+        return normalized
 
     def _require(
-        self, determined: NDArray[np.bool_], given: Float64, whose: str, codec: Orientation | None = None
+        self, determined: NDArray[np.bool_], numbers: Float64, whose: str, codec: Orientation | None = None
     ) -> None:
         if determined.all():
             return
         codec = codec or self._numbers
         row, arm = np.argwhere(~determined)[0]
-        found = ", ".join(f"{number:g}" for number in given[row, arm])
+        text = ", ".join(f"{number:g}" for number in numbers[row, arm])
         raise PolicyError(
-            f"{whose} no orientation for {self._arms[arm]} in row {row}: {', '.join(codec.fields)} = {found}; "
+            f"{whose} no orientation for {self._arms[arm]} in row {row}: {', '.join(codec.fields)} = {text}; "
             f"allowed: {codec.allowed}"
         )
 
 
 def continuous_quaternions(quaternions: Float64) -> Float64:
     """Return unit quaternions [T, arms, 4] with w >= 0 in the first row and continuous signs along T."""
-    made = quaternions.copy()
-    made[:1] *= np.where(made[:1, :, :1] < 0, -1.0, 1.0)
-    return made * continuous_signs(made)
+    continuous = quaternions.copy()
+    continuous[:1] *= np.where(continuous[:1, :, :1] < 0, -1.0, 1.0)
+    return continuous * continuous_signs(continuous)
 
 
 def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
     """Return the indices of the appended groups' joints in the robot's vector, in the declared order."""
-    others = [group.name for group in robot.groups if group.chain is None]
+    plain_groups = [group.name for group in robot.groups if group.chain is None]
     for place, name in enumerate(pose.groups):
-        if name not in others or name in pose.groups[:place]:
+        if name not in plain_groups or name in pose.groups[:place]:
             raise ConfigurationError(
                 f"{key}.groups = {pose.groups}: {name!r} cannot follow the poses; "
-                f"allowed: each once of {', '.join(others) or 'none'} (groups of {robot.name} without end effector)"
+                f"allowed: each once of {', '.join(plain_groups) or 'none'} (groups of {robot.name} "
+                "without end effector)"
             )
     chosen = [robot.group(name).slice for name in pose.groups]
     parts = [np.arange(part.start, part.stop) for part in chosen]

@@ -63,15 +63,15 @@ def relative(vectors: Float64, start: Float64, mode: ActionMode, frame: Relative
 
 def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
     """Return unit quaternions `before` rotated by `turns`, about their own axes ("tool") or about the frame's axes."""
-    made = quaternion_product(before, turns) if frame == "tool" else quaternion_product(turns, before)
-    unit: Float64 = made / np.linalg.norm(made, axis=-1, keepdims=True)
+    product = quaternion_product(before, turns) if frame == "tool" else quaternion_product(turns, before)
+    unit: Float64 = product / np.linalg.norm(product, axis=-1, keepdims=True)
     return unit
 
 
 def _cumulative_products(turns: Float64, frame: RelativeFrame) -> Float64:
     """Return cumulative products of the turns [T, arms, 4], by doubling (Hillis and Steele, 1986): log2 T products."""
-    made, span = turns, 1
-    while span < len(made):
-        made = np.concatenate([made[:span], _after(made[:-span], made[span:], frame)])
+    products, span = turns, 1
+    while span < len(products):
+        products = np.concatenate([products[:span], _after(products[:-span], products[span:], frame)])
         span *= 2
-    return made
+    return products
