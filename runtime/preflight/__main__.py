@@ -40,13 +40,13 @@ _BACKGROUND_NICE = 5  # stations on the same machine have priority
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one preflight and print its report."""
     parser = _parser()
-    given = parser.parse_args(arguments)
-    if given.given == (given.deployment is not None) or (given.given and given.assignments):
+    options = parser.parse_args(arguments)
+    if options.given == (options.deployment is not None) or (options.given and options.assignments):
         parser.error("give one of the two: a deployment file, or --given")
-    if given.given:
+    if options.given:
         return _for_a_parent()
-    report = preflight(lambda: loader.load(given.deployment, given.assignments), given.deadline)
-    print(json.dumps(report.to_dict(), indent=1) if given.json else "\n".join(report.lines()))
+    report = preflight(lambda: loader.load(options.deployment, options.assignments), options.deadline)
+    print(json.dumps(report.to_dict(), indent=1) if options.json else "\n".join(report.lines()))
     return exit_code(report)
 
 
@@ -58,7 +58,7 @@ def preflight(resolved: Any, deadline: float | None = None) -> Report:
         deadline: Time for everything [s]; None: the sum of the policy's own deadlines.
     """
     try:
-        made = check_deployment(resolved())
+        spec = check_deployment(resolved())
     except RuntimeFault as fault:
         return Report(
             PreflightVerdict.MISCONFIGURED,
@@ -66,7 +66,7 @@ def preflight(resolved: Any, deadline: float | None = None) -> Report:
             str(fault),
             PreflightVerdict.MISCONFIGURED.advice,
         )
-    return PreflightRunner(made).run(default_deadline(made.deployment) if deadline is None else deadline)
+    return PreflightRunner(spec).run(default_deadline(spec.deployment) if deadline is None else deadline)
 
 
 def exit_code(report: Report) -> int:
@@ -107,24 +107,24 @@ def _for_a_parent() -> int:
     """
     os.nice(_BACKGROUND_NICE)
     log.configure_logging("preflight")
-    asked = json.loads(_line())
+    request = json.loads(_line())
     threading.Thread(target=_end_with_parent, name="lifeline", daemon=True).start()
-    report = preflight(lambda: _asked_for(asked), asked.get("deadline_s"))
+    report = preflight(lambda: _asked_for(request), request.get("deadline_s"))
     print(json.dumps(report.to_dict()), flush=True)
     wait_closed(_GOODBYE_S)
     os._exit(exit_code(report))  # without waiting for a policy's own threads
 
 
-def _asked_for(asked: Mapping[str, Any]) -> Resolved:
-    changes = asked.get("changes", {})
-    if "tree" in asked:  # the station has already checked the permissions
-        base = loader.resolve_deployment(asked["tree"], {}, "the station's deployment")
+def _asked_for(request: Mapping[str, Any]) -> Resolved:
+    changes = request.get("changes", {})
+    if "tree" in request:  # the station has already checked the permissions
+        base = loader.resolve_deployment(request["tree"], {}, "the station's deployment")
         return loader.apply_changes(base, changes, "the checkpoint")
-    if "deployment" not in asked:
+    if "deployment" not in request:
         raise ConfigurationError(
-            f"preflight: given {', '.join(asked) or 'nothing'}; needed: tree or deployment"
+            f"preflight: given {', '.join(request) or 'nothing'}; needed: tree or deployment"
         )
-    base = loader.load(Path(asked["deployment"]))
+    base = loader.load(Path(request["deployment"]))
     resolved = loader.apply_changes(base, changes, "the checkpoint")
     require_allowed_references(base.deployment, resolved.deployment)
     return resolved
@@ -132,13 +132,13 @@ def _asked_for(asked: Mapping[str, Any]) -> Resolved:
 
 def _line() -> bytes:
     """Read the first line of standard input, without consuming further input."""
-    said = b""
-    while not said.endswith(b"\n"):
-        one = os.read(0, 1)
-        if not one:
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = os.read(0, 1)
+        if not byte:
             raise SystemExit("preflight --given: standard input ended before its line")
-        said += one
-    return said
+        line += byte
+    return line
 
 
 def _end_with_parent() -> None:

@@ -91,12 +91,12 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as a dict of JSON's own types."""
-        told = asdict(self)
+        fields = asdict(self)
         return {
-            **told,
+            **fields,
             "verdict": str(self.verdict),
             "stage": str(self.stage),
-            "calls": list(told["calls"]),
+            "calls": list(fields["calls"]),
             "notes": list(self.notes),
             "metadata": truncate_value(self.metadata),
             "ok": self.ok,
@@ -106,13 +106,13 @@ class Report:
 
     def lines(self) -> list[str]:
         """Return the report as lines for a terminal."""
-        made = [f"{self.verdict}  at {self.stage}", self.sentence]
-        made += [self.advice] if self.advice else []
-        made += [f"policy    {self._policy()}"] if self.kind else []
-        made += [f"{call.name:<9} {call.ms:.0f} ms{_call_summary(call)}" for call in self.calls]
-        made += [f"chunk     {chunk_summary(self.chunk)}"] if self.chunk else []
-        made += [f"metadata  {key} = {value}" for key, value in truncate_value(self.metadata).items()]
-        return made + [f"note      {note}" for note in self.notes]
+        lines = [f"{self.verdict}  at {self.stage}", self.sentence]
+        lines += [self.advice] if self.advice else []
+        lines += [f"policy    {self._policy()}"] if self.kind else []
+        lines += [f"{call.name:<9} {call.ms:.0f} ms{_call_summary(call)}" for call in self.calls]
+        lines += [f"chunk     {chunk_summary(self.chunk)}"] if self.chunk else []
+        lines += [f"metadata  {key} = {value}" for key, value in truncate_value(self.metadata).items()]
+        return lines + [f"note      {note}" for note in self.notes]
 
     def _policy(self) -> str:
         return ", ".join(filter(None, [self.kind, self.name, self.endpoint, f"for {self.robot}"]))
@@ -141,14 +141,16 @@ def truncate_value(value: Any, depth: int = 0) -> Any:
     if isinstance(value, Mapping | list | tuple) and depth >= _DEEPEST:
         return "..."
     if isinstance(value, Mapping):
-        kept = {
-            str(key)[:_LONGEST_TEXT]: truncate_value(one, depth + 1)
-            for key, one in list(value.items())[:_LONGEST_LIST]
+        truncated = {
+            str(key)[:_LONGEST_TEXT]: truncate_value(item, depth + 1)
+            for key, item in list(value.items())[:_LONGEST_LIST]
         }
-        return kept | ({"...": f"{len(value) - _LONGEST_LIST} more"} if len(value) > _LONGEST_LIST else {})
+        return truncated | (
+            {"...": f"{len(value) - _LONGEST_LIST} more"} if len(value) > _LONGEST_LIST else {}
+        )
     if isinstance(value, list | tuple):
         more = [f"... {len(value) - _LONGEST_LIST} more"] if len(value) > _LONGEST_LIST else []
-        return [truncate_value(one, depth + 1) for one in value[:_LONGEST_LIST]] + more
+        return [truncate_value(item, depth + 1) for item in value[:_LONGEST_LIST]] + more
     text = str(value)
     return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 

@@ -98,10 +98,10 @@ class PreflightRunner:
         Time in which kinematics are compiled does not count, because it does not depend on the policy.
         """
         ended: list[RuntimeFault | BaseException | None] = []
-        way = threading.Thread(target=lambda: ended.append(self._outcome()), name="preflight", daemon=True)
-        way.start()
-        while way.is_alive() and (left := deadline - self._spent()) > 0:
-            way.join(min(left, _LOOK_S))
+        thread = threading.Thread(target=lambda: ended.append(self._outcome()), name="preflight", daemon=True)
+        thread.start()
+        while thread.is_alive() and (left := deadline - self._spent()) > 0:
+            thread.join(min(left, _LOOK_S))
         if not ended:
             return self._overdue(deadline)
         error = ended[0]
@@ -149,8 +149,8 @@ class PreflightRunner:
         spaces, subject = ActionSpaces(spec.robot, kinematics, spec.rate), VirtualRobot(spec, self._clock)
         asking = PolicyRequests(policy, spec.deployment.task, spaces, subject, runner, self._clock)
         for _ in range(2):  # the first request resets before
-            answered = self._answered = asking.send(k_max=strategy.parameters.k_max).result()
-        asking.log_ik_problems(answered)
+            response = self._answered = asking.send(k_max=strategy.parameters.k_max).result()
+        asking.log_ik_problems(response)
         self._notes += [note.text for note in asking.notes]
         runner.submit(
             policy.reset
@@ -169,15 +169,15 @@ class PreflightRunner:
 
     def _overdue(self, deadline: float) -> Report:
         policy = self._policy
-        what = "before the policy was there"
+        phase = "before the policy was there"
         if policy is not None:
             waited = self._clock.now() - policy.since
-            what = f"while the policy's {policy.current_call} was under way for {waited:.1f} s"
-            what = what if policy.current_call else "between two calls of the policy"
+            phase = f"while the policy's {policy.current_call} was under way for {waited:.1f} s"
+            phase = phase if policy.current_call else "between two calls of the policy"
         report = self._report(
             PreflightVerdict.TIMEOUT,
             self._stage(PreflightVerdict.TIMEOUT),
-            f"no end within {deadline:g} s, {what}",
+            f"no end within {deadline:g} s, {phase}",
         )
         if policy is not None:
             policy.close()
@@ -220,10 +220,10 @@ class PreflightRunner:
         """Duration of the last request [ms]."""
         return [call.ms for call in self._policy.calls if call.name == "infer"][-1] if self._policy else 0.0
 
-    def _chunk(self, answered: PolicyResponse) -> Chunk:
-        spec, chunk, made = self._plan, answered.chunk, answered.commands
-        first = first_action(made.intended_start, np.asarray(answered.observation.qpos, np.float64), spec)
-        beyond = (spec.limits.excess(made.rows) > _TOLERANCE).any(axis=1)
+    def _chunk(self, response: PolicyResponse) -> Chunk:
+        spec, chunk, commands = self._plan, response.chunk, response.commands
+        first = first_action(commands.intended_start, np.asarray(response.observation.qpos, np.float64), spec)
+        beyond = (spec.limits.excess(commands.rows) > _TOLERANCE).any(axis=1)
         rate = chunk.rate or spec.rate
         return Chunk(
             rows=len(chunk.actions),
@@ -231,36 +231,36 @@ class PreflightRunner:
             space=chunk.space,
             mode=chunk.mode,
             rate=rate,
-            seconds=len(made.rows) / spec.rate,
-            command_rows=len(made.rows),
-            joints=made.rows.shape[1],
+            seconds=len(commands.rows) / spec.rate,
+            command_rows=len(commands.rows),
+            joints=commands.rows.shape[1],
             first_away=first["distance"],
             first_joint=first["joint"],
             beyond_limits=int(beyond.sum()),
         )
 
     def _remarks(self, info: PolicyInfo | None, chunk: Chunk) -> list[str]:
-        settings, made = self._plan.deployment, []
+        settings, remarks = self._plan.deployment, []
         if chunk.first_away > settings.safety.first_action_far:
-            made.append(
+            remarks.append(
                 f"the first action is far from the pose {settings.setup.pose!r}; it was asked with grey pictures, so "
                 "that may mean nothing"
             )
         if chunk.beyond_limits:
-            made.append(
+            remarks.append(
                 f"{chunk.beyond_limits} of {chunk.command_rows} rows leave the joint limits: safety would hold a robot "
                 "there"
             )
         if info is not None and info.horizon is not None and info.horizon != chunk.rows:
-            made.append(f"the server says {info.horizon} rows per answer and gave {chunk.rows}")
-        made += self._rtc_remarks()
+            remarks.append(f"the server says {info.horizon} rows per answer and gave {chunk.rows}")
+        remarks += self._rtc_remarks()
         answers = [call.ms for call in self._policy.calls if call.name == "infer"] if self._policy else []
         if len(answers) > 1 and answers[1] > 1000.0 * chunk.seconds:
-            made.append(
+            remarks.append(
                 f"an answer takes {answers[1]:.0f} ms and is {1000.0 * chunk.seconds:.0f} ms of motion: the "
                 "robot will stop and wait"
             )
-        return made
+        return remarks
 
     def _rtc_remarks(self) -> list[str]:
         """Return remarks if the strategy continues the model's own rows, which must then be absolute."""

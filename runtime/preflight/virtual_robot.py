@@ -55,10 +55,10 @@ class VirtualRobot:
 def noise_images(spec: StationSpec) -> dict[str, UInt8]:
     """Return grey noise [H, W, 3] for each camera of the deployment, in its size; it is the same at every call."""
     noise = np.random.default_rng(0)
-    made: dict[str, UInt8] = {}
+    images: dict[str, UInt8] = {}
     for key in spec.cameras:
         width, height = getattr(spec.deployment.cameras.get(key), "size", None) or (_WIDTH, _HEIGHT)
         grain = noise.integers(-_GRAIN, _GRAIN + 1, (height, width, 3))
-        made[key] = (_GREY + grain).astype(np.uint8)
-        made[key].flags.writeable = False
-    return made
+        images[key] = (_GREY + grain).astype(np.uint8)
+        images[key].flags.writeable = False
+    return images
