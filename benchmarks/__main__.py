@@ -59,24 +59,24 @@ def main() -> int:
         "--long", "--full", action="store_true", help=f"more and longer cases, for {' and '.join(_LONG)}"
     )
     parser.add_argument("--seed", type=int, help=f"of what happens, for {' and '.join(_SEEDED)}; else drawn")
-    given = parser.parse_args()
-    if given.assignments and given.name not in _SETTABLE:
+    arguments = parser.parse_args()
+    if arguments.assignments and arguments.name not in _SETTABLE:
         parser.error(f"--set is for {' and '.join(_SETTABLE)}")
-    if given.long and given.name not in _LONG:
+    if arguments.long and arguments.name not in _LONG:
         parser.error(f"--long is for {' and '.join(_LONG)}")
-    if given.seed is not None and given.name not in _SEEDED:
+    if arguments.seed is not None and arguments.name not in _SEEDED:
         parser.error(f"--seed is for {' and '.join(_SEEDED)}")
-    if given.seconds and given.minutes:
+    if arguments.seconds and arguments.minutes:
         parser.error("--seconds and --minutes say the same: give one of them")
-    module = importlib.import_module(f"benchmarks.{given.name}")
-    seconds = given.seconds or 60.0 * (given.minutes or 0.0) or getattr(module, "SECONDS", _SECONDS)
-    options = {"long": True} if given.long else {}
-    if given.seed is not None:
-        options["seed"] = given.seed
-    report = module.measure(seconds, *([given.assignments] if given.assignments else []), **options)
-    print(report.json() if given.json == "-" else report.table())
-    if given.json not in (None, "-"):
-        report.write(Path(given.json))
+    module = importlib.import_module(f"benchmarks.{arguments.name}")
+    seconds = arguments.seconds or 60.0 * (arguments.minutes or 0.0) or getattr(module, "SECONDS", _SECONDS)
+    options = {"long": True} if arguments.long else {}
+    if arguments.seed is not None:
+        options["seed"] = arguments.seed
+    report = module.measure(seconds, *([arguments.assignments] if arguments.assignments else []), **options)
+    print(report.json() if arguments.json == "-" else report.table())
+    if arguments.json not in (None, "-"):
+        report.write(Path(arguments.json))
     return 0 if all(figure.holds is not False for figure in report.figures) else 1
 
 

@@ -41,7 +41,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ready_file", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
     from evaweb.lab.lab import open_lab
@@ -49,14 +49,14 @@ def main() -> int:
 
     try:
         with open_lab("127.0.0.1", 0) as lab:
-            _up(lab, given)
+            _up(lab, options)
             lab.watch()
     except StopRequested:  # the normal end
         return 0
     return 1
 
 
-def _up(lab: Any, given: argparse.Namespace) -> None:
+def _up(lab: Any, options: argparse.Namespace) -> None:
     from evaweb.accounts.roles import Role
     from evaweb.lab import demo_rows, programs
     from evaweb.lab.benches import Bench
@@ -71,12 +71,12 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
         f'transport.pub_endpoint="{node["action_endpoint"]}"',
         f'policy.url="{policy["url"]}"',
         *PATIENT,
-        *given.assignments,
+        *options.assignments,
     ]
     url = lab.start([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])
     login = demo_rows.demo_login(username="operator", role=Role.OPERATOR)
     facts = {"url": url, "passwords": {login.username: login.password}, "node": node["obs_endpoint"]}
-    announce_ready({**facts, "pids": lab.processes.pids()}, given.ready_file)
+    announce_ready({**facts, "pids": lab.processes.pids()}, options.ready_file)
 
 
 if __name__ == "__main__":

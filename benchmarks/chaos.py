@@ -80,22 +80,24 @@ def counted(acts: Iterable[Act], found: DataAtEnd) -> dict[str, list[str]]:
     acts = list(acts)
     runs = {act.episode: act for act in acts if act.kind == "run" and act.uuid not in found.unopened}
     scores = {act.uuid for act in acts if act.kind == "score"}
-    kept = {uuid for _, uuid in found.scores}
+    stored = {uuid for _, uuid in found.scores}
     prepared = {act.trial for act in acts if act.kind == "prepare"}
-    twice = [f"score {uuid}" for uuid, n in Counter(uuid for _, uuid in found.scores).items() if n > 1]
+    doubled = [f"score {uuid}" for uuid, n in Counter(uuid for _, uuid in found.scores).items() if n > 1]
     scored = Counter(trial for trial, _ in found.scores)
-    twice += [f"trial {trial} has {n} scores" for trial, n in scored.items() if n > 1]
-    twice += [f"episode {uuid} is that of {n}" for uuid, n in Counter(found.trial_episodes).items() if n > 1]
-    twice += [f"trial {trial} was prepared by nobody" for trial in found.trials if trial not in prepared]
-    here = found.rows & found.folders
+    doubled += [f"trial {trial} has {n} scores" for trial, n in scored.items() if n > 1]
+    doubled += [
+        f"episode {uuid} is that of {n}" for uuid, n in Counter(found.trial_episodes).items() if n > 1
+    ]
+    doubled += [f"trial {trial} was prepared by nobody" for trial in found.trials if trial not in prepared]
+    in_lab = found.rows & found.folders
     return {
         "lost_episodes": sorted(set(runs) - (found.rows & (found.folders | found.at_home))),
-        "lost_scores": sorted(scores - kept),
+        "lost_scores": sorted(scores - stored),
         "lost_trials": sorted(str(trial) for trial in prepared - set(found.trials)),
-        "doubled": twice,
+        "doubled": doubled,
         "stuck_trials": [f"trial {n} is {s}" for n, s in found.trials.items() if s not in _OVER]
         + found.refusing,
-        "lost_after_delete": sorted(set(runs) - found.at_home - here),
+        "lost_after_delete": sorted(set(runs) - found.at_home - in_lab),
     }
 
 
@@ -153,8 +155,8 @@ class _Operator(threading.Thread):
         return self._end(number)
 
     def _prepare(self) -> Mapping[str, Any]:
-        wanted = {"scene": "block-on-plate", "position": 1, "checkpoint": "chaos"}
-        return self._request("post", f"stations/{PRESSED}/trials", wanted, again=False)
+        choice = {"scene": "block-on-plate", "position": 1, "checkpoint": "chaos"}
+        return self._request("post", f"stations/{PRESSED}/trials", choice, again=False)
 
     def _begin(self, number: int) -> None:
         answer = self._command("run", number)
@@ -208,8 +210,8 @@ class _Operator(threading.Thread):
                 if not self._logged_in:
                     self._visitor.login("operator", self._password)
                     self._logged_in = True
-                found: Mapping[str, Any] = getattr(self._visitor, verb)(*given)
-                return found
+                answer: Mapping[str, Any] = getattr(self._visitor, verb)(*given)
+                return answer
             except DemoFailed as fault:
                 unknown = isinstance(fault, NoReply) or "HTTP 50" in str(fault)
                 self._logged_in = self._logged_in and "HTTP 401" not in str(fault)
@@ -225,29 +227,33 @@ class _Operator(threading.Thread):
 
 def _name(process: psutil.Process) -> str:
     """Return the name of a process that belongs to lab or station, "" for any other process."""
-    words = process.cmdline()
-    found = [name for name in _OF_LAB if any(one.endswith("manage.py") for one in words) and name in words]
-    found += [name for name in _OF_STATION if f"runtime.processes.{name}.process" in words]
-    found += ["link"] if "runtime.link" in words else []
-    return found[0] if found else ""
+    arguments = process.cmdline()
+    names = [
+        name
+        for name in _OF_LAB
+        if any(argument.endswith("manage.py") for argument in arguments) and name in arguments
+    ]
+    names += [name for name in _OF_STATION if f"runtime.processes.{name}.process" in arguments]
+    names += ["link"] if "runtime.link" in arguments else []
+    return names[0] if names else ""
 
 
 def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
     """Return the current processes by name; of several with the same name the first."""
-    found: dict[str, psutil.Process] = {}
+    by_name: dict[str, psutil.Process] = {}
     for parent in parents:
         for child in parent.children(recursive=False):
             try:
-                found.setdefault(_name(child), child)
+                by_name.setdefault(_name(child), child)
             except psutil.Error:  # it has just ended
                 continue
-    found.pop("", None)
-    return found
+    by_name.pop("", None)
+    return by_name
 
 
 def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Random) -> Counter[str]:
     """Kill and pause processes for `seconds`; return how often, by name."""
-    done: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     of_station: list[float] = []
     until = time.monotonic() + seconds
     while (now := time.monotonic()) < until:
@@ -267,8 +273,8 @@ def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Ra
                 of_station += [time.monotonic()] if name in _OF_STATION else []
         except psutil.NoSuchProcess:  # it has ended by itself
             continue
-        done[name] += 1
-    return done
+        counts[name] += 1
+    return counts
 
 
 def measure(seconds: float, seed: int | None = None) -> Report:
@@ -304,16 +310,16 @@ def measure(seconds: float, seed: int | None = None) -> Report:
                     hurt = _hurt(parents, seconds, chance)
                     operator.over.set()
                     operator.join()
-                    found = _at_rest(operator, robot, folder / "data")
+                    state = _at_rest(operator, robot, folder / "data")
         finally:
             bench.close()
-    wrong = counted(operator.acts, found)
+    wrong = counted(operator.acts, state)
     kinds = Counter(act.kind for act in operator.acts)
     figures = [Figure(name, float(len(things)), "", "== 0") for name, things in wrong.items()]
     figures += [Figure(f"acknowledged.{kind}", float(n), "") for kind, n in sorted(kinds.items())]
     figures += [Figure(f"killed.{kind}", float(n), "") for kind, n in sorted(hurt.items())]
-    figures += [Figure("never_begun", float(len(found.unopened)), "")]
-    figures += [Figure("removed_at_home", float(len(found.folders - found.at_home)), "")]
+    figures += [Figure("never_begun", float(len(state.unopened)), "")]
+    figures += [Figure("removed_at_home", float(len(state.folders - state.at_home)), "")]
     figures += [Figure("voided_at_rest", float(operator.voided), "")]
     rows = [{"seed": seed, "wrong": wrong, "said": operator.said.most_common(30)}]
     return Report("chaos", figures, [*rows, *map(asdict, operator.acts)])
@@ -336,15 +342,15 @@ def _at_rest(operator: _Operator, robot: Path, data: Path) -> DataAtEnd:
     from evaweb.stations.models import Command
     from evaweb.trials.models import Score, Trial
 
-    until, taken, before = time.monotonic() + _REST_S, False, len(operator.acts)
-    while not taken and time.monotonic() < until:
-        taken = operator.once() and any(act.kind == "run" for act in operator.acts[before:])
+    until, worked, before = time.monotonic() + _REST_S, False, len(operator.acts)
+    while not worked and time.monotonic() < until:
+        worked = operator.once() and any(act.kind == "run" for act in operator.acts[before:])
     while time.monotonic() < until and _closed(robot) - _closed(data):
         time.sleep(1.0)
     left = Trial.objects.filter(status__in=("ended", "interrupted")).values_list("pk", flat=True)
     for number in list(left):
-        if why := operator.leave_none(number):
-            operator.said[f"stuck: {why}"[:200]] += 1
+        if reason := operator.leave_none(number):
+            operator.said[f"stuck: {reason}"[:200]] += 1
     command = [sys.executable, str(ROOT / "manage.py"), "reconcile"]
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     runs = Command.objects.filter(kind="run").exclude(unopened="")
@@ -359,7 +365,7 @@ def _at_rest(operator: _Operator, robot: Path, data: Path) -> DataAtEnd:
         folders=_closed(data),
         at_home=_closed(robot),
         unopened={str(uuid) for uuid in runs.values_list("pk", flat=True)},
-        refusing=[] if taken else [f"{PRESSED}: {json.dumps(operator.said.most_common(3))}"],
+        refusing=[] if worked else [f"{PRESSED}: {json.dumps(operator.said.most_common(3))}"],
     )
 
 

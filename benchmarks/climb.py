@@ -100,23 +100,23 @@ def viewers(running: RunningLab, name: str, seconds: float) -> tuple[list[Figure
     return _told("viewers", rungs, f"nothing up to {_MOST_VIEWERS}")
 
 
-def _told(what: str, rungs: list[_Rung], otherwise: str) -> tuple[list[Figure], list[Mapping[str, Any]]]:
+def _told(label: str, rungs: list[_Rung], otherwise: str) -> tuple[list[Figure], list[Mapping[str, Any]]]:
     most = max((rung.count for rung in rungs if rung.holds), default=0)
     failed = [rung for rung in rungs if not rung.holds]
-    rows = [rung.row(what) for rung in rungs]
+    rows = [rung.row(label) for rung in rungs]
     saturated = failed[0].saturated if failed else otherwise
-    return [Figure(f"{what}_max", float(most), "")], [*rows, {f"{what}_saturated_first": saturated}]
+    return [Figure(f"{label}_max", float(most), "")], [*rows, {f"{label}_saturated_first": saturated}]
 
 
 def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds: float) -> _Rung:
     """Open `pages` pages in all on the stations `names` for `seconds`, press in turn, and return the measured step."""
     watching = [watch(running.visitor, seconds, station=name, reading=pages) for name in names]
     open_pages = [OpenPage(running.visitor, running.announced["stops"], name) for name in names]
-    taken: list[float] = []
+    times_ms: list[float] = []
     before, begun = _used(), time.monotonic()
     while time.monotonic() - begun < seconds:
-        page = open_pages[len(taken) % len(open_pages)]
-        taken.append(page.press(f"press {len(taken)}").ms)
+        page = open_pages[len(times_ms) % len(open_pages)]
+        times_ms.append(page.press(f"press {len(times_ms)}").ms)
         time.sleep(_PAUSE_S)
     passed, after = time.monotonic() - begun, _used()
     percent = {name: 100.0 * (used - before.get(name, 0.0)) / passed for name, used in after.items()}
@@ -127,7 +127,7 @@ def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds
     fullest = max(percent, key=lambda name: percent[name])
     return _Rung(
         count,
-        float(np.percentile(taken, 99)),
+        float(np.percentile(times_ms, 99)),
         float(np.percentile(ages, 99)) if ages else float("inf"),
         machine,
         fullest.rpartition(" ")[0],
@@ -137,12 +137,12 @@ def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds
 
 def _used() -> dict[str, float]:
     """Return the processor time [s] of every process by name and id; under "" that of the whole machine."""
-    found: dict[str, float] = {}
+    usage: dict[str, float] = {}
     for process in psutil.process_iter():
         try:
             name, times = named(process.cmdline()), process.cpu_times()
         except psutil.Error:  # it has ended, or access is denied
             continue
-        found[f"{name} {process.pid}"] = times.user + times.system
-    found[""] = machine_used()
-    return found
+        usage[f"{name} {process.pid}"] = times.user + times.system
+    usage[""] = machine_used()
+    return usage

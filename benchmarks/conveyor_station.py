@@ -38,9 +38,9 @@ _KEPT = 4  # frames whose image can still be rendered
 @cache
 def _renderer(robot: str) -> Renderer:
     """Return the renderer of the overhead camera, shared by all stations of this process."""
-    made = robots.load_robot(robot)
-    above = tuple(camera for camera in made.cameras if camera_arm(made, camera) is None)
-    return Renderer(replace(made, cameras=above), CONVEYOR, _WIDTH, _HEIGHT)
+    loaded = robots.load_robot(robot)
+    above = tuple(camera for camera in loaded.cameras if camera_arm(loaded, camera) is None)
+    return Renderer(replace(loaded, cameras=above), CONVEYOR, _WIDTH, _HEIGHT)
 
 
 @cache
@@ -130,15 +130,17 @@ def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -
         "recording": {"enabled": False},
         "lockstep": {"delay_ticks": delay},
     }
-    made = check_deployment(loader.resolve_deployment(tree, {}, "moving_target"))
-    gallery = DeferredPicturesEnvironment(made.robot, Conveyor(made.robot, seed))
+    station_spec = check_deployment(loader.resolve_deployment(tree, {}, "moving_target"))
+    gallery = DeferredPicturesEnvironment(station_spec.robot, Conveyor(station_spec.robot, seed))
     clock = VirtualClock()
     options = parser().parse_args(
-        ["--robot", made.robot.name, "--bench", "conveyor", "--start-pose", "ready"]
+        ["--robot", station_spec.robot.name, "--bench", "conveyor", "--start-pose", "ready"]
     )
-    script = ChaseScript(made.robot, HORIZON, made.rate, clock=clock, places=_places(made.robot.name))
+    script = ChaseScript(
+        station_spec.robot, HORIZON, station_spec.rate, clock=clock, places=_places(station_spec.robot.name)
+    )
     peers = replace(
-        in_process_peers(made, clock, gallery, options),
+        in_process_peers(station_spec, clock, gallery, options),
         policy=lambda spec, clock: ScriptPolicy(script, gallery),
     )
-    return gallery.conveyor, Lockstep(made, clock, peers=peers)
+    return gallery.conveyor, Lockstep(station_spec, clock, peers=peers)

@@ -75,8 +75,8 @@ def _scenes(*rates: float) -> Case:
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         scenes = {str(i): (chance.random(n) < rate).tolist() for i, rate in enumerate(rates)}
-        found = bounded_mean(scenes, seed=_seed(chance), draws=draws)
-        return found.interval.holds(float(np.mean(rates)))
+        estimate = bounded_mean(scenes, seed=_seed(chance), draws=draws)
+        return estimate.interval.holds(float(np.mean(rates)))
 
     return Case(holds)
 
@@ -88,12 +88,12 @@ def _conditions(first: float, second: float, spread: float, trials: int) -> Case
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = first + spread * chance.uniform(-1, 1, n)
-        one: dict[Hashable, list[float]] = {
+        left: dict[Hashable, list[float]] = {
             i: (chance.random(trials) < rate).tolist() for i, rate in enumerate(rates)
         }
-        other: dict[Hashable, list[float]] = {i: (chance.random(trials) < second).tolist() for i in range(n)}
-        found = over_conditions(one, other, seed=_seed(chance), draws=draws)
-        return found.interval.holds(first - second)
+        right: dict[Hashable, list[float]] = {i: (chance.random(trials) < second).tolist() for i in range(n)}
+        estimate = over_conditions(left, right, seed=_seed(chance), draws=draws)
+        return estimate.interval.holds(first - second)
 
     return Case(holds, fewest=2)
 
@@ -110,30 +110,30 @@ def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
 
 
 def _rate(
-    interval: Callable[[int, int], Interval | None], given: float | None = None, wanted: str = _WANTED
+    interval: Callable[[int, int], Interval | None], fixed: float | None = None, allowed: str = _WANTED
 ) -> Case:
-    """Return the case of successes of one checkpoint whose rate is `given`, or uniform random."""
+    """Return the case of successes of one checkpoint whose rate is `fixed`, or uniform random."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
-        truth = chance.random() if given is None else given
-        found = interval(int(chance.binomial(n, truth)), n)
-        return found is not None and found.holds(truth)
+        truth = chance.random() if fixed is None else fixed
+        estimated = interval(int(chance.binomial(n, truth)), n)
+        return estimated is not None and estimated.holds(truth)
 
-    return Case(holds, wanted=wanted)
+    return Case(holds, wanted=allowed)
 
 
 def _per_hour(chance: Chance, n: int, draws: int) -> bool:
     return rate(int(chance.poisson(n)), 3600.0).interval.holds(n)
 
 
-def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, wanted: str) -> Case:
+def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, allowed: str) -> Case:
     """Return the case of the mean of one number per trial, which `draw` generates with the mean `truth`."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
-        found = average(draw(chance, n).tolist())
-        return found is not None and found.interval is not None and found.interval.holds(truth)
+        estimate = average(draw(chance, n).tolist())
+        return estimate is not None and estimate.interval is not None and estimate.interval.holds(truth)
 
-    return Case(holds, fewest=2, wanted=wanted)
+    return Case(holds, fewest=2, wanted=allowed)
 
 
 def _anytime(first: float, second: float) -> Case:
@@ -143,9 +143,9 @@ def _anytime(first: float, second: float) -> Case:
     """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
-        one, other = (chance.random((2, n)) < [[first], [second]]).astype(float)
-        found = confidence_sequence((one - other).tolist())
-        return found is not None and found.holds(first - second)
+        left, right = (chance.random((2, n)) < [[first], [second]]).astype(float)
+        sequence = confidence_sequence((left - right).tolist())
+        return sequence is not None and sequence.holds(first - second)
 
     return Case(holds)
 
@@ -156,17 +156,17 @@ def _preferred(chance: Chance, n: int, draws: int) -> bool:
     Also True if no interval is shown.
     """
     weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's weights with frequent ties
-    said = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()
+    preferred = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()
     turned: dict[str, Any] = {"first": "second", "tie": "tie", "second": "first"}
     rows = [
         Comparison("a", "b", word) if i % 2 else Comparison("b", "a", turned[word])
-        for i, word in enumerate(said)
+        for i, word in enumerate(preferred)
     ]
     try:
-        found = preferences(rows, order_effect=True)
+        result = preferences(rows, order_effect=True)
     except NotIdentifiedError:
         return True
-    return found.contrasts["a", "b"].interval.holds(1.0)
+    return result.contrasts["a", "b"].interval.holds(1.0)
 
 
 def _seed(chance: Chance) -> int:

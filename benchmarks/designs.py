@@ -114,10 +114,10 @@ def measure(seconds: float, long: bool = False) -> Report:
     `drift.DESIGN.N`. With `long` designs of 250 pairs are measured, too; an interrupted measurement is continued.
     """
     rows: Courses = []
-    kept = PartStore() if long else None
+    store = PartStore() if long else None
     figures: list[Figure] = []
     for name, part in _parts((*SIZES, MOST) if long else SIZES):
-        for figure in kept.once(name, part, rows) if kept else part(rows):
+        for figure in store.once(name, part, rows) if store else part(rows):
             print(
                 f"{figure.name} {figure.value:.4g}", file=sys.stderr, flush=True
             )  # progress, because all figures take minutes
@@ -173,10 +173,10 @@ def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
         rows.append({"type1": name, "pairs": n, "largest": largest, "bound": bound})
         yield Figure(f"type1.{name}.{n}", bound, "", f"<= {case.alpha}")
     else:
-        found = max((_found(case, (rate, rate), n) for rate in _some(case)), key=lambda found: found.power)
-        rows.append({"type1": name, "pairs": n, "simulated": found.power, "error": found.error})
+        worst = max((_found(case, (rate, rate), n) for rate in _some(case)), key=lambda worst: worst.power)
+        rows.append({"type1": name, "pairs": n, "simulated": worst.power, "error": worst.error})
         allowed = case.alpha + 3 * math.sqrt(case.alpha * (1 - case.alpha) / _runs(case))
-        yield Figure(f"type1.{name}.{n}", found.power, "", f"<= {allowed:.4f}")
+        yield Figure(f"type1.{name}.{n}", worst.power, "", f"<= {allowed:.4f}")
 
 
 def powers(rows: Courses) -> Iterator[Figure]:
@@ -187,16 +187,16 @@ def powers(rows: Courses) -> Iterator[Figure]:
     """
     for name, case in DESIGNS.items():
         for rates, n in SAME if case.margin else DIFFERENT:
-            found, wanted, soon = _found(case, rates, n), "", ""
+            characteristics, allowed, soon = _found(case, rates, n), "", ""
             if name == "late":
-                wanted = f">= {_found(DESIGNS['fixed'], rates, n).power - 0.05:.4f}"
+                allowed = f">= {_found(DESIGNS['fixed'], rates, n).power - 0.05:.4f}"
             if name == "early":
                 power, median = STEP[rates, n]
-                wanted, soon = f">= {power - 0.02:.4f}", f"<= {1.1 * median:.1f}"
+                allowed, soon = f">= {power - 0.02:.4f}", f"<= {1.1 * median:.1f}"
             at = f"{name}.{rates[0]}.{rates[1]}.{n}"
-            rows.append({"course": at, **found._asdict()})
-            yield Figure(f"power.{at}", found.power, "", wanted)
-            yield Figure(f"median_pairs.{at}", found.median, "", soon)
+            rows.append({"course": at, **characteristics._asdict()})
+            yield Figure(f"power.{at}", characteristics.power, "", allowed)
+            yield Figure(f"median_pairs.{at}", characteristics.median, "", soon)
     for rates, n in DIFFERENT:
         yield Figure(f"power.scipy_barnard.{rates[0]}.{rates[1]}.{n}", _of_scipy(rates, n), "")
 
@@ -212,16 +212,16 @@ def estimates(rows: Courses) -> Iterator[Figure]:
         assert exact is not None
         for rates in ((0.5, 0.5), (0.5, 0.7), (0.5, 0.8)):
             truth, at = rates[0] - rates[1], f"{name}.{rates[0]}.{rates[1]}.{SIZES[0]}"
-            raw = corrected = held = 0.0
+            raw = corrected = covered = 0.0
             for (a, n, b, m), mass in _ends(exact, rates):
-                found = stagewise(exact, a, n, b, m)
+                estimate = stagewise(exact, a, n, b, m)
                 raw += mass * (a / n - b / m)
-                corrected += mass * found.value
-                held += mass * (found.interval.low <= truth <= found.interval.high)
-            rows.append({"estimate": at, "raw": raw, "corrected": corrected, "held": held})
+                corrected += mass * estimate.value
+                covered += mass * (estimate.interval.low <= truth <= estimate.interval.high)
+            rows.append({"estimate": at, "raw": raw, "corrected": corrected, "held": covered})
             yield Figure(f"bias.raw.{at}", raw - truth, "")
             yield Figure(f"bias.corrected.{at}", corrected - truth, "")
-            yield Figure(f"coverage.corrected.{at}", held, "", ">= 0.94")
+            yield Figure(f"coverage.corrected.{at}", covered, "", ">= 0.94")
 
 
 def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, int], float]]:
@@ -233,11 +233,11 @@ def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, 
     for pair in range(1, pairs + 1):
         for axis, rate in enumerate(rates):
             alive = alive * (1 - rate) + np.roll(alive * rate, 1, axis=axis)
-        there = alive[: pair + 1, : pair + 1]
-        ending = there > 0 if pair == pairs else looks[pair] & (there > 0)
+        reached = alive[: pair + 1, : pair + 1]
+        ending = reached > 0 if pair == pairs else looks[pair] & (reached > 0)
         for a, b in np.argwhere(ending):
-            yield (int(a), pair, int(b), pair), float(there[a, b])
-        there[ending] = 0.0
+            yield (int(a), pair, int(b), pair), float(reached[a, b])
+        reached[ending] = 0.0
 
 
 def drifts(rows: Courses) -> Iterator[Figure]:
@@ -265,10 +265,10 @@ def boundary_of(case: Case, pairs: int) -> Boundary | None:
         return Boundary((StoppingTable(pairs, pairs, _least(pairs, case.alpha)),), case.alpha)
     looks = range(case.every, pairs, case.every) if case.every > 1 else ()
     counts = counts_of(_in_random_order(pairs), "ab") if case.random else None
-    found = design(
+    result = design(
         rule=case.rule, blocks=pairs, alpha=case.alpha, margin=case.margin, looks=looks, counts=counts
     )
-    return found.boundary
+    return result.boundary
 
 
 def _in_random_order(blocks: int) -> list[Unit]:
@@ -299,7 +299,9 @@ def families(rows: Courses) -> Iterator[Figure]:
         for rate in _SOME_RATES:
             won = np.random.default_rng(7).random((_RUNS, SIZES[0], 3)) < rate
             ended = (findings(planned, [tuple(enumerate(map(float, block))) for block in run]) for run in won)
-            worst = max(worst, sum(any(one.winner for one in found.each) for found in ended) / _RUNS)
+            worst = max(
+                worst, sum(any(comparison.winner for comparison in outcome.each) for outcome in ended) / _RUNS
+            )
         rows.append({"family": name, "blocks": SIZES[0], "simulated": worst})
         yield Figure(f"type1.{name}.{SIZES[0]}", worst, "", f"<= {allowed:.4f}")
 
@@ -314,7 +316,7 @@ def choices(rows: Courses) -> Iterator[Figure]:
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
     for rates in _CHOICES:
         arms, best = range(len(rates)), max(rates)
-        wanted = {arm for arm in arms if rates[arm] == best} if rates.count(best) == 1 else set()
+        best_arms = {arm for arm in arms if rates[arm] == best} if rates.count(best) == 1 else set()
         for rule, drops in ((FIXED, False), ("early", True)):
             pairs = tuple(combinations(arms, 2))
             planned = design(
@@ -323,20 +325,20 @@ def choices(rows: Courses) -> Iterator[Figure]:
             won = np.random.default_rng(7).random((_RUNS, SIZES[0], len(rates))) < rates
             called, chosen, trials = [], [], []
             for run in won:
-                said = findings(planned, [tuple(enumerate(map(float, block))) for block in run])
-                left = unbeaten(planned, said)
-                made = {arm: said.dropped.get(arm, said.at or SIZES[0]) for arm in arms}
-                trials.append(sum(made.values()))
+                conclusions = findings(planned, [tuple(enumerate(map(float, block))) for block in run])
+                left = unbeaten(planned, conclusions)
+                trials_of = {arm: conclusions.dropped.get(arm, conclusions.at or SIZES[0]) for arm in arms}
+                trials.append(sum(trials_of.values()))
                 called.append(left[0] if len(left) == 1 else None)
-                chosen.append(max(left, key=lambda arm: run[: made[arm], arm].mean(), default=None))
-            wrong = sum(arm is not None and arm not in wanted for arm in called) / _RUNS
+                chosen.append(max(left, key=lambda arm: run[: trials_of[arm], arm].mean(), default=None))
+            wrong = sum(arm is not None and arm not in best_arms for arm in called) / _RUNS
             at = f"{rule}.{'.'.join(map(str, rates))}.{SIZES[0]}"
             said_of = {"wrong": wrong, "trials": float(np.median(trials))}
-            if wanted:
-                said_of["found"] = sum(arm in wanted for arm in called) / _RUNS
-                said_of["chosen_wrong"] = sum(arm not in wanted for arm in chosen) / _RUNS
-            for what, value in said_of.items():
-                yield Figure(f"best.{what}.{at}", value, "", f"<= {allowed:.4f}" if what == "wrong" else "")
+            if best_arms:
+                said_of["found"] = sum(arm in best_arms for arm in called) / _RUNS
+                said_of["chosen_wrong"] = sum(arm not in best_arms for arm in chosen) / _RUNS
+            for label, value in said_of.items():
+                yield Figure(f"best.{label}.{at}", value, "", f"<= {allowed:.4f}" if label == "wrong" else "")
             rows.append({"best": at, **said_of})
 
 
@@ -364,7 +366,7 @@ def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
     around the best in ever finer steps, each as the angle whose squared sine is the rate.
     """
     angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
-    lines = [(one, (one + other) / 2, other) for one, other in product(angles, repeat=2)]
+    lines = [(start, (start + end) / 2, end) for start, end in product(angles, repeat=2)]
     error, best = _worst(exact, lines)
     step = float(angles[1] - angles[0]) / 2
     for _ in range(_ROUNDS):
@@ -379,9 +381,9 @@ def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, 
     pairs = exact.looks[-1].first
     places = np.linspace(0, 2, pairs)
     rates = np.array([np.interp(places, range(3), np.sin(angles) ** 2) for angles in knots])
-    found = errors_at(exact, rates)
-    at = int(found.argmax())
-    return float(found[at]), knots[at]
+    errors = errors_at(exact, rates)
+    at = int(errors.argmax())
+    return float(errors[at]), knots[at]
 
 
 def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -400,9 +402,9 @@ def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64
             alive = alive * (1 - rate) + np.roll(alive * rate, 1, axis=axis)  # the last entry is still empty
         if pair in looks:
             region = looks[pair]
-            there = alive[:, : pair + 1, : pair + 1]
-            stopped += there[:, region].sum(axis=1)
-            there[:, region] = 0.0
+            reached = alive[:, : pair + 1, : pair + 1]
+            stopped += reached[:, region].sum(axis=1)
+            reached[:, region] = 0.0
     return stopped
 
 
@@ -435,11 +437,11 @@ def _simulated(case: Case, rates: Rates, pairs: int) -> SimulatedPower:
     planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, outcome=case.outcome)
     scores = chance.binomial(_STEPS, rates, size=(_RUNS, pairs, 2)) / _STEPS
     ended = [
-        evaluate_design(planned, in_blocks([(one, other) for one, other in run])) for run in scores.tolist()
+        evaluate_design(planned, in_blocks([(left, right) for left, right in run])) for run in scores.tolist()
     ]
-    power = sum(found.winner is not None for found in ended) / _RUNS
+    power = sum(outcome.winner is not None for outcome in ended) / _RUNS
     return SimulatedPower(
-        power, float(np.median([found.ended_at_pair or pairs for found in ended])), _error(power, _RUNS)
+        power, float(np.median([outcome.ended_at_pair or pairs for outcome in ended])), _error(power, _RUNS)
     )
 
 
@@ -457,5 +459,5 @@ def _of_scipy(rates: Rates, n: int) -> float:
         for b in range(min(a, n - a + 1)):
             if barnard_exact([[a, b], [n - a, n - b]]).pvalue <= ALPHA:
                 alike = {(a, b), (b, a), (n - a, n - b), (n - b, n - a)}
-                power += sum(float(first[one] * second[other]) for one, other in alike)
+                power += sum(float(first[left] * second[right]) for left, right in alike)
     return power

@@ -75,8 +75,8 @@ def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
     """Measure `WAY_p99_ms.ATTACK` for each way of pressing, lost presses, and whether station and web still run."""
     rows = []
     for attack in attacks:
-        with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as found:
-            rows.append(measure_attack(found, attack, seconds))
+        with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as lab_bench:
+            rows.append(measure_attack(lab_bench, attack, seconds))
     missing = why_not()
     if missing:
         print(f"not measured on PostgreSQL: {missing}", file=sys.stderr)
@@ -91,8 +91,10 @@ def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
 def _on_postgresql(seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "postgresql"
-        with server(database) as url, bench(Path(folder) / "lab", database, url) as found:
-            return measure_attack(found, "database_hangs", seconds) | {"attack": "database_hangs.postgresql"}
+        with server(database) as url, bench(Path(folder) / "lab", database, url) as lab_bench:
+            return measure_attack(lab_bench, "database_hangs", seconds) | {
+                "attack": "database_hangs.postgresql"
+            }
 
 
 @contextmanager
@@ -115,19 +117,20 @@ def measure_attack(
     facts = found.lab.announced
     program = RestPresser(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
     with closing(OpenPage(found.operator, facts["stops"])) as page:
-        ways = dict(zip(WAYS, (page.press, page.over_the_socket, program.press), strict=True))
+        senders = dict(zip(WAYS, (page.press, page.over_the_socket, program.press), strict=True))
         found.station.wait_until_up()
         if moving:
-            _warmed(found, *ways.values())
+            _warmed(found, *senders.values())
             found.station.run()
         watching = StationWatch(found.station, facts["pids"]["web"])
         with _under(found, attack, share) as did:
             time.sleep(seconds / 4.0)  # without presses: the run must continue
             pressed = {
-                name: _presses(found.station, press, seconds / len(ways)) for name, press in ways.items()
+                name: _presses(found.station, press, seconds / len(senders))
+                for name, press in senders.items()
             }
     recovery = page_load_time(found.operator, _GIVEN_UP_S)
-    beside = watching.end()
+    watched = watching.end()
     return {
         "attack": attack,
         **pressed,
@@ -135,15 +138,15 @@ def measure_attack(
         "recovery_s": _GIVEN_UP_S if recovery is None else recovery,
         "interrupted": _interruption(found.station),
         "attacker": dict(did),
-        **beside._asdict(),
+        **watched._asdict(),
     }
 
 
-def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
+def _warmed(lab_bench: Bench, *ways: Callable[[str], Press]) -> None:
     """Press in each of `ways` and load a page, so that first-time costs count neither as delay nor as memory growth."""
     for press in ways:
         press("to begin with")
-    page_load_time(found.operator, _GIVEN_UP_S)
+    page_load_time(lab_bench.operator, _GIVEN_UP_S)
 
 
 def _interruption(station: Station) -> str:
@@ -154,14 +157,25 @@ def _interruption(station: Station) -> str:
 
 
 @contextmanager
-def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
+def _under(lab_bench: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
     """Run the attack within the context; afterwards the yielded map has the attacker's counts."""
     did: dict[str, int] = {}
     if attack == "none":
         yield did
         return
-    command = [sys.executable, "-m", "benchmarks.attacks", attack, str(found.ready_file), str(found.lab.data)]
-    command += ["--share", str(share), *(["--database", str(found.database)] if found.database else [])]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.attacks",
+        attack,
+        str(lab_bench.ready_file),
+        str(lab_bench.lab.data),
+    ]
+    command += [
+        "--share",
+        str(share),
+        *(["--database", str(lab_bench.database)] if lab_bench.database else []),
+    ]
     child = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert child.stdin is not None
     assert child.stdout is not None
@@ -176,8 +190,8 @@ def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
-        told = child.stdout.read()
-    did |= json.loads(told) if told else {}
+        output = child.stdout.read()
+    did |= json.loads(output) if output else {}
 
 
 def _presses(station: Station, press: Callable[[str], Press], seconds: float) -> dict[str, Any]:
@@ -185,11 +199,11 @@ def _presses(station: Station, press: Callable[[str], Press], seconds: float) ->
 
     After a failed release there are no more releases.
     """
-    made: list[Press] = []
+    presses: list[Press] = []
     lost, releases = 0, True
     until = time.monotonic() + seconds
-    while len(made) < _FEWEST or time.monotonic() < until:
-        made.append(press(f"press {len(made) + 1}"))
+    while len(presses) < _FEWEST or time.monotonic() < until:
+        presses.append(press(f"press {len(presses) + 1}"))
         if not station.latched:
             lost += 1
         elif releases:
@@ -197,7 +211,7 @@ def _presses(station: Station, press: Callable[[str], Press], seconds: float) ->
                 station.release() or station.release()
             )  # the copy of a press may arrive late by the other way
         time.sleep(_PAUSE_S)
-    return summarize_presses(made, lost) | {"released": releases}
+    return summarize_presses(presses, lost) | {"released": releases}
 
 
 def summarize_presses(presses: Sequence[Press], lost: int) -> dict[str, Any]:
@@ -220,14 +234,14 @@ def summarize_presses(presses: Sequence[Press], lost: int) -> dict[str, Any]:
 def figures(row: dict[str, Any]) -> Iterator[Figure]:
     """Yield the figures of one attack."""
     attack = row["attack"]
-    for way in WAYS:
-        found = row[way]
-        wanted = f"<= {_WANTED_MS}" if way == "estop" else ""
-        yield Figure(f"{way}_p99_ms.{attack}", found["p99_ms"], "ms", wanted)
-        yield Figure(f"{way}_p50_ms.{attack}", found["p50_ms"], "ms")
-        yield Figure(f"{way}_presses.{attack}", found["presses"], "")
-        for what in ("lost", "failed", "unanswered"):
-            yield Figure(f"{way}_{what}.{attack}", found[what], "", "== 0")
+    for channel in WAYS:
+        values = row[channel]
+        allowed = f"<= {_WANTED_MS}" if channel == "estop" else ""
+        yield Figure(f"{channel}_p99_ms.{attack}", values["p99_ms"], "ms", allowed)
+        yield Figure(f"{channel}_p50_ms.{attack}", values["p50_ms"], "ms")
+        yield Figure(f"{channel}_presses.{attack}", values["presses"], "")
+        for label in ("lost", "failed", "unanswered"):
+            yield Figure(f"{channel}_{label}.{attack}", values[label], "", "== 0")
     yield Figure(f"run_interrupted.{attack}", float(bool(row["interrupted"])), "", "== 0")
     yield Figure(f"main_late_ms.{attack}", row["main_late_ms"], "ms")
     yield Figure(f"web_growth_mb.{attack}", row["web_growth_mb"], "MB")

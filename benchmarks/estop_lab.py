@@ -39,7 +39,7 @@ def main() -> int:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ready_file", type=Path)
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
     from evaweb.lab.lab import open_lab
@@ -48,7 +48,7 @@ def main() -> int:
     _limit_files()
     try:
         with open_lab("127.0.0.1", 0) as lab:
-            _up(lab, given.ready_file)
+            _up(lab, options.ready_file)
             lab.watch()
     except StopRequested:  # the normal end
         return 0
@@ -84,8 +84,8 @@ def _up(lab: Any, ready_file: Path) -> None:
     policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
     # Programs are named after deployment files: each station needs its own.
     pressed = _bench("demo.toml", PRESSED, node["obs_endpoint"], node["action_endpoint"], policy["url"])
-    other = _bench("tabletop.toml", OTHER, _NOWHERE, _NOWHERE, "ws://127.0.0.1:1")
-    url = lab.start([Bench(*pressed), Bench(*other)])
+    tabletop = _bench("tabletop.toml", OTHER, _NOWHERE, _NOWHERE, "ws://127.0.0.1:1")
+    url = lab.start([Bench(*pressed), Bench(*tabletop)])
     announce_ready({"url": url, "stops": lab.stops, **_people(), "pids": lab.processes.pids()}, ready_file)
 
 

@@ -58,10 +58,10 @@ class _Page(LivePage):
         self._send({"type": "estop", "uuid": identity, "why": why})
         while (left := begun + PATIENCE_S - time.monotonic()) > 0 and not self.broken:
             try:
-                at, said = acks.get(timeout=min(left, 0.2))
+                at, ack = acks.get(timeout=min(left, 0.2))
             except queue.Empty:
                 continue
-            return Press(said["status"], said["reason"], (at - begun) * 1000.0)
+            return Press(ack["status"], ack["reason"], (at - begun) * 1000.0)
         return Press("", self.broken or "no answer", (time.monotonic() - begun) * 1000.0)
 
     def _on_message(self, message: Mapping[str, Any]) -> None:
@@ -85,12 +85,12 @@ class OpenPage:
     def press(self, why: str) -> Press:
         """Press in both ways with one uuid; return the first press that was executed, or a failed one."""
         identity, answers = str(uuid4()), queue.SimpleQueue[Press]()
-        ways = (self.over_the_socket, self._way.press)
-        for way in ways:
-            requests = lambda way=way: answers.put(way(why, identity))  # noqa: E731
+        senders = (self.over_the_socket, self._way.press)
+        for sender in senders:
+            requests = lambda sender=sender: answers.put(sender(why, identity))  # noqa: E731
             threading.Thread(target=requests, daemon=True).start()
         pressed = [answers.get()]
-        while pressed[-1].status != _DONE and len(pressed) < len(ways):
+        while pressed[-1].status != _DONE and len(pressed) < len(senders):
             pressed.append(answers.get())
         return next((press for press in pressed if press.status == _DONE), pressed[0])
 
@@ -125,19 +125,19 @@ class RestPresser:
         """Press and wait for the answer."""
         begun = time.monotonic()
         try:
-            said = self.post("POST", "estop", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
+            reply = self.post("POST", "estop", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
         except (OSError, http.client.HTTPException, ValueError) as fault:
             return Press("", f"{type(fault).__name__}: {fault}", (time.monotonic() - begun) * 1000.0)
         took = time.monotonic() - begun
-        answered = took <= PATIENCE_S
-        return Press(said.get("status", "refused") if answered else "", str(said)[:200], took * 1000.0)
+        in_time = took <= PATIENCE_S
+        return Press(reply.get("status", "refused") if in_time else "", str(reply)[:200], took * 1000.0)
 
     def post(self, method: str, what: str, body: str = "") -> dict[str, Any]:
         """Return the answer to a request to `estop` or `commands`."""
         with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
             connection.request(method, f"/api/v1/stations/{self._station}/{what}", body, self._headers)
-            found: dict[str, Any] = json.loads(connection.getresponse().read())
-            return found
+            reply: dict[str, Any] = json.loads(connection.getresponse().read())
+            return reply
 
 
 def page_load_time(visitor: RestClient, seconds: float) -> float | None:

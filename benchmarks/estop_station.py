@@ -43,8 +43,8 @@ class Station:
 
     def pids(self) -> list[int]:
         """Return the process ids of coordinator and guard."""
-        found = Endpoints(self._folder).read("supervisor")
-        return [int(found[name]) for name in _FAMILY]
+        endpoints = Endpoints(self._folder).read("supervisor")
+        return [int(endpoints[name]) for name in _FAMILY]
 
     def wait_until_up(self) -> Mapping[str, Any]:
         """Return the status as soon as the station answers.
@@ -63,18 +63,18 @@ class Station:
 
     def run(self) -> None:
         """Set up and begin a run without end; if the machine was late, try again."""
-        why = ""
+        reason = ""
         for _ in range(_TRIES):
             try:
                 status = self._tried()
             except RuntimeFault as fault:
-                why = str(fault)
+                reason = str(fault)
                 continue
             if status["state_is"]["going"]:
                 self._newest_event = status["newest_event"]
                 return
-            why = status["reason"]
-        raise SystemExit(f"{PRESSED} does not run: {why}")
+            reason = status["reason"]
+        raise SystemExit(f"{PRESSED} does not run: {reason}")
 
     def _tried(self) -> Mapping[str, Any]:
         """Try to set up and run; return the state one second after the start of the run, or the state reached
@@ -138,8 +138,8 @@ class StationWatch:
         self._before = _memory(self._web), _memory(self._family)
         self._most = self._before
         self._threads = [
-            threading.Thread(target=work, args=given, daemon=True)
-            for work, given in (
+            threading.Thread(target=work, args=arguments, daemon=True)
+            for work, arguments in (
                 (self._listen, (station.client,)),
                 (self._claim, (station.another_client(),)),
                 (self._poll, ()),
@@ -181,10 +181,10 @@ class StationWatch:
 
 def _memory(pids: list[int]) -> float:
     """Return the memory of processes [bytes]; a process that has ended counts as 0."""
-    found = 0.0
+    total = 0.0
     for pid in pids:
         try:
-            found += psutil.Process(pid).memory_info().rss
+            total += psutil.Process(pid).memory_info().rss
         except psutil.NoSuchProcess:
             continue
-    return found
+    return total

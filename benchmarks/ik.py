@@ -152,15 +152,15 @@ def _judged(robot: Robot, chunks: Sequence[Chunk], solved: Sequence[IkResult]) -
     steps = np.abs(np.diff(np.concatenate([seeds[:, None], q], axis=1), axis=1))
     away = np.stack([result.position_error for result in solved]) * 1e3
     turned = np.degrees(np.stack([result.rotation_error for result in solved]))
-    held = np.stack([result.flags for result in solved]) & (IkFlag.AT_LIMIT | IkFlag.AT_VELOCITY) != 0
-    free = ~held if chunks[0].reachable else np.ones_like(held)
+    constrained = np.stack([result.flags for result in solved]) & (IkFlag.AT_LIMIT | IkFlag.AT_VELOCITY) != 0
+    free = ~constrained if chunks[0].reachable else np.ones_like(constrained)
     return {
         "position_error_mm": float(away[free].max()),
         "position_error_mean_mm": float(away[free].mean()),
         "rotation_error_deg": float(turned[free].max()),
         "rotation_error_mean_deg": float(turned[free].mean()),
-        "held_share": float(held.mean()),
-        "position_error_held_mm": float(away[held].max(initial=0.0)),
+        "held_share": float(constrained.mean()),
+        "position_error_held_mm": float(away[constrained].max(initial=0.0)),
         "largest_step": float(steps.max()),
         "velocity_ratio": float((steps / chunks[0].dt / robot.velocity[dims]).max()),
         "violations": int(((q < robot.lower[dims]) | (q > robot.upper[dims])).sum()),
@@ -175,12 +175,12 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
     """Return the figures of a row; only those of the default backend have requirements."""
     case = f"{row['robot']}.{row['trajectory']}" + ("" if _ours(row) else f".{row['kind']}")
     reachable = row["trajectory"] != OUT_OF_REACH
-    wanted = {"chunk_ms": "<= 0.5" if reachable else "<= 1", "velocity_ratio": "<= 1"}
+    allowed = {"chunk_ms": "<= 0.5" if reachable else "<= 1", "velocity_ratio": "<= 1"}
     if reachable:
-        wanted["arm_ms"] = "<= 0.2" if row["joints"] > 6 else "<= 0.1"
+        allowed["arm_ms"] = "<= 0.2" if row["joints"] > 6 else "<= 0.1"
     if reachable:
         exact = "<= 0.01" if row["trajectory"] == "smooth" else "<= 0.05"
-        wanted |= {"position_error_mm": exact, "rotation_error_deg": "<= 0.02"}
+        allowed |= {"position_error_mm": exact, "rotation_error_deg": "<= 0.02"}
     units = {
         "chunk_ms": "ms",
         "arm_ms": "ms",
@@ -196,7 +196,7 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
         "velocity_ratio": "",
     }
     return [
-        Figure(f"{name}.{case}", row[name], unit, wanted.get(name, "") if _ours(row) else "")
+        Figure(f"{name}.{case}", row[name], unit, allowed.get(name, "") if _ours(row) else "")
         for name, unit in units.items()
     ]
 
@@ -233,13 +233,13 @@ def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
 
     Wall time would depend on the machine's load, and more so for long calls.
     """
-    ours = {(row["robot"], row["trajectory"]): row["chunk_cpu_ms"] for row in rows if _ours(row)}
+    own_ms = {(row["robot"], row["trajectory"]): row["chunk_cpu_ms"] for row in rows if _ours(row)}
     return [
         Figure(
-            f"ratio.{row['robot']}.{row['trajectory']}.{row['kind']}", row["chunk_cpu_ms"] / ours[key], "x"
+            f"ratio.{row['robot']}.{row['trajectory']}.{row['kind']}", row["chunk_cpu_ms"] / own_ms[key], "x"
         )
         for row in rows
-        if not _ours(row) and (key := (row["robot"], row["trajectory"])) in ours
+        if not _ours(row) and (key := (row["robot"], row["trajectory"])) in own_ms
     ]
 
 
@@ -251,9 +251,9 @@ def _fk() -> list[Figure]:
         return []
     robot, recording = robots.load_robot(_RECORDED), recorded(Path(folder))
     module = variants("runtime.kinematics")[_DEFAULT]
-    found = module.build(module.Config(), robot).forward(recording.joints)
-    away = np.linalg.norm(found[..., :3] - recording.poses[..., :3], axis=-1) * 1e3
-    cosine = np.abs(np.sum(found[..., 3:] * recording.poses[..., 3:], axis=-1))
+    poses = module.build(module.Config(), robot).forward(recording.joints)
+    away = np.linalg.norm(poses[..., :3] - recording.poses[..., :3], axis=-1) * 1e3
+    cosine = np.abs(np.sum(poses[..., 3:] * recording.poses[..., 3:], axis=-1))
     turned = np.degrees(2 * np.arccos(np.minimum(1.0, cosine)))
     return [
         Figure("real_episode_fk_mm", float(away.max()), "mm", "<= 0.15"),
@@ -287,10 +287,10 @@ def _first_chunk(name: str, cache: str) -> dict[str, float]:
     used, begun = _children_s(), time.perf_counter()
     with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        told: dict[str, float] = json.loads(process.stdout.readline())
-        told["seconds"] = time.perf_counter() - begun
-    told["cpu_s"] = _children_s() - used
-    return told
+        timings: dict[str, float] = json.loads(process.stdout.readline())
+        timings["seconds"] = time.perf_counter() - begun
+    timings["cpu_s"] = _children_s() - used
+    return timings
 
 
 def _children_s() -> float:

@@ -45,16 +45,16 @@ def invented(robot: Robot) -> dict[str, list[Chunk]]:
     """
     chance = np.random.default_rng(5)
     kinds = ("smooth", "singular", "through", OUT_OF_REACH)
-    made: dict[str, list[Chunk]] = {kind: [] for kind in kinds}
+    chunks: dict[str, list[Chunk]] = {kind: [] for kind in kinds}
     for _ in range(CHUNKS):
         path = _path(robot, _within(robot, chance, 0.25), _within(robot, chance, 0.25))
-        made["smooth"].append(_chunk(robot, path))
-        made[OUT_OF_REACH].append(_leaving(_chunk(robot, path)))
+        chunks["smooth"].append(_chunk(robot, path))
+        chunks[OUT_OF_REACH].append(_leaving(_chunk(robot, path)))
         for kind, smallest in (("singular", _NEAR), ("through", 0.0)):
             middle = _with_singular_value(robot, chance, smallest)
             ends = _ends_around(robot, middle, _within(robot, chance, 0.05))
-            made[kind].append(_chunk(robot, _path(robot, *ends)))
-    return made
+            chunks[kind].append(_chunk(robot, _path(robot, *ends)))
+    return chunks
 
 
 def _chunk(robot: Robot, path: Float64) -> Chunk:
@@ -114,18 +114,18 @@ def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64
 
 def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
     """Return joints [T, D] that accelerate from `start` towards `end` and decelerate, as far as speed limits allow."""
-    way = end - start
+    travel = end - start
     dims = arm_dims(robot)
     steepest = math.pi / 2 * robot.control_rate / (ROWS - 1)
-    rush = np.abs(way[dims]) * steepest / (_UNHURRIED * robot.velocity[dims])
-    share = 1 / max(1.0, rush.max(), np.abs(way).max() / _TURN)
+    rush = np.abs(travel[dims]) * steepest / (_UNHURRIED * robot.velocity[dims])
+    share = 1 / max(1.0, rush.max(), np.abs(travel).max() / _TURN)
     eased = (1 - np.cos(np.linspace(0, math.pi, ROWS))) / 2
-    path: Float64 = start + eased[:, None] * share * way
+    path: Float64 = start + eased[:, None] * share * travel
     return path
 
 
-def _with_singular_value(robot: Robot, chance: np.random.Generator, wanted: float) -> Float64:
-    """Return a posture in which the Jacobian of every arm has nearly the smallest singular value `wanted`.
+def _with_singular_value(robot: Robot, chance: np.random.Generator, target: float) -> Float64:
+    """Return a posture in which the Jacobian of every arm has nearly the smallest singular value `target`.
 
     It is found by random search.
     """
@@ -133,12 +133,12 @@ def _with_singular_value(robot: Robot, chance: np.random.Generator, wanted: floa
     low, high = low + 0.1 * (high - low), high - 0.1 * (high - low)
     posture = _within(robot, chance, 0.1)
     for arm in robot.arms:
-        best, reach = abs(_smallest(arm, posture) - wanted), 0.5
+        best, reach = abs(_smallest(arm, posture) - target), 0.5
         for _ in range(_SEARCHES):
             tried = posture.copy()
             tried[arm.joint_dims] += chance.normal(0, reach, len(arm.joint_dims))
             tried = np.clip(tried, low, high)
-            off = abs(_smallest(arm, tried) - wanted)
+            off = abs(_smallest(arm, tried) - target)
             if off < best:
                 posture, best = tried, off
             else:
@@ -154,8 +154,8 @@ def _smallest(arm: Group, posture: Float64) -> float:
 def _ends_around(robot: Robot, middle: Float64, towards: Float64) -> tuple[Float64, Float64]:
     """Return two postures within the limits that have `middle` halfway between them."""
     low, high = _bounds(robot)
-    way = np.minimum(np.abs(towards - middle), np.minimum(middle - low, high - middle)) * np.sign(
+    half_travel = np.minimum(np.abs(towards - middle), np.minimum(middle - low, high - middle)) * np.sign(
         towards - middle
     )
-    way = np.minimum(np.abs(way), _TURN / 2) * np.sign(way)
-    return middle - way, middle + way
+    half_travel = np.minimum(np.abs(half_travel), _TURN / 2) * np.sign(half_travel)
+    return middle - half_travel, middle + half_travel

@@ -50,15 +50,15 @@ def drift(robot: Robot, kinematics: Kinematics) -> Float64:
     home, dims = robot.poses["home"], arm_dims(robot)
     rows = round(_LOOP_S * robot.control_rate)
     angles = np.tile(np.arange(1, rows + 1) / rows * 2 * math.pi, LOOPS)
-    found = []
+    steps = []
     for first, second in _PLANES:
         targets = np.repeat(kinematics.forward(home)[None], len(angles), axis=0)
         targets[..., first] += RADIUS * (np.cos(angles) - 1)[:, None]
         targets[..., second] += RADIUS * np.sin(angles)[:, None]
         q = followed(kinematics, robot, targets, home, ROWS).q
         ends = np.concatenate([home[None], q[rows - 1 :: rows]])[:, dims]
-        found.append(np.abs(np.diff(ends, axis=0)).max(axis=1))
-    return np.stack(found)
+        steps.append(np.abs(np.diff(ends, axis=0)).max(axis=1))
+    return np.stack(steps)
 
 
 def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Float64:
@@ -70,14 +70,14 @@ def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Floa
     at[dims] = chance.uniform(low, high)
     rows = [at[None]]
     for _ in range(legs):
-        way = np.zeros(robot.dim)
-        way[dims] = chance.uniform(low, high) - at[dims]
-        way *= min(1.0, leg / np.abs(way).max())
-        seconds = (np.abs(way[dims]) * math.pi / 2 / (_HURRY * robot.velocity[dims])).max()
+        travel = np.zeros(robot.dim)
+        travel[dims] = chance.uniform(low, high) - at[dims]
+        travel *= min(1.0, leg / np.abs(travel).max())
+        seconds = (np.abs(travel[dims]) * math.pi / 2 / (_HURRY * robot.velocity[dims])).max()
         count = max(2, math.ceil(seconds * robot.control_rate))
         eased = (1 - np.cos(np.linspace(0, math.pi, count + 1)[1:])) / 2
-        rows.append(at + eased[:, None] * way)
-        at = at + way
+        rows.append(at + eased[:, None] * travel)
+        at = at + travel
     return np.concatenate(rows)
 
 

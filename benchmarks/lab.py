@@ -125,16 +125,16 @@ def _measured(
     for unit in ("cpu_percent", "memory_mb"):
         idle[f"{unit}.station"] = sum(idle[f"{unit}.{name}"] for name in station)
     through = _presses(running, seconds)
-    here = _presses_here(robot, seconds / 4)
+    local_ms = _presses_here(robot, seconds / 4)
     processes = {"link": link, "gate": psutil.Process(running.announced["pids"]["gate"])}
     sending, upload = _upload(running, robot, processes)
     lost = _cuts(running, link)
-    taken = np.array([press.ms for press in through])
+    times_ms = np.array([press.ms for press in through])
     figures = [
-        Figure("estop_p50_ms", float(np.percentile(taken, 50)), "ms"),
-        Figure("estop_p99_ms", float(np.percentile(taken, 99)), "ms", "<= 100"),
+        Figure("estop_p50_ms", float(np.percentile(times_ms, 50)), "ms"),
+        Figure("estop_p99_ms", float(np.percentile(times_ms, 99)), "ms", "<= 100"),
         Figure("estop_not_done", float(sum(press.status != "done" for press in through)), "", "== 0"),
-        Figure("estop_here_p99_ms", float(np.percentile(here, 99)), "ms"),
+        Figure("estop_here_p99_ms", float(np.percentile(local_ms, 99)), "ms"),
         Figure("estop_uploading_p99_ms", sending, "ms", "<= 100"),
         *(Figure(name, value, "s" if name.startswith("cpu") else "MB/s") for name, value in upload.items()),
         Figure("lost_shown_s", max(lost), "s", "<= 1.5"),
@@ -151,12 +151,12 @@ def _idle(processes: Mapping[str, psutil.Process], seconds: float) -> dict[str, 
     """Return the load of idle processes [% of a core] and their proportional memory [MB]."""
     before = {name: sum(process.cpu_times()[:2]) for name, process in processes.items()}
     time.sleep(seconds)
-    found: dict[str, float] = {}
+    usage: dict[str, float] = {}
     for name, process in processes.items():
         used = sum(process.cpu_times()[:2]) - before[name]
-        found[f"cpu_percent.{name}"] = 100.0 * used / seconds
-        found[f"memory_mb.{name}"] = process.memory_full_info().pss / 1e6
-    return found
+        usage[f"cpu_percent.{name}"] = 100.0 * used / seconds
+        usage[f"memory_mb.{name}"] = process.memory_full_info().pss / 1e6
+    return usage
 
 
 def _presses(running: RunningLab, seconds: float) -> list[Press]:
@@ -173,16 +173,16 @@ def _presses(running: RunningLab, seconds: float) -> list[Press]:
 
 def _presses_here(robot: Path, seconds: float) -> list[float]:
     """Press at the station's own socket, repeatedly for `seconds`; return the durations [ms]."""
-    taken: list[float] = []
+    times_ms: list[float] = []
     client = StationClient(robot / "stations" / PRESSED, "benchmark")
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         begun = time.monotonic()
-        client.estop(f"press {len(taken)}")
-        taken.append((time.monotonic() - begun) * 1000.0)
+        client.estop(f"press {len(times_ms)}")
+        times_ms.append((time.monotonic() - begun) * 1000.0)
         time.sleep(_PAUSE_S)
     client.close()
-    return taken
+    return times_ms
 
 
 def _upload(
@@ -206,16 +206,16 @@ def _upload(
     pressed = _presses(running, _UPLOAD_MB / 50 * 0.7)
     _until((running.data / "episodes" / folder.name).exists, "the episode")
     seconds = time.monotonic() - begun
-    found = {"upload_mb_s": _UPLOAD_MB / seconds}
+    usage = {"upload_mb_s": _UPLOAD_MB / seconds}
     for name, process in processes.items():
         used = sum(process.cpu_times()[:2]) - before[name]
-        found[f"cpu_s_per_gb.{name}"] = used / (_UPLOAD_MB / 1000)
-    return float(np.percentile([press.ms for press in pressed], 99)), found
+        usage[f"cpu_s_per_gb.{name}"] = used / (_UPLOAD_MB / 1000)
+    return float(np.percentile([press.ms for press in pressed], 99)), usage
 
 
 def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
     """Return for each pause of the link (SIGSTOP) the time until an open page shows that the link is lost [s]."""
-    page, shown = _Page(running.visitor, PRESSED), []
+    page, delays = _Page(running.visitor, PRESSED), []
     try:
         for _ in range(_CUTS):
             _until(lambda: page.link_ok, "the link")
@@ -223,12 +223,12 @@ def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
             link.send_signal(signal.SIGSTOP)
             try:
                 _until(lambda: not page.link_ok, "the loss")
-                shown.append(time.monotonic() - begun)
+                delays.append(time.monotonic() - begun)
             finally:
                 link.send_signal(signal.SIGCONT)
     finally:
         page.close()
-    return shown
+    return delays
 
 
 def enrol(robot: Path, words: Sequence[str]) -> None:
@@ -243,16 +243,16 @@ def _link_of(supervisor: psutil.Process) -> psutil.Process | None:
     return next((child for child in children if "runtime.link" in child.cmdline()), None)
 
 
-def _until(found: Callable[[], Found], what: str) -> Found:
-    until, why = time.monotonic() + _PATIENCE_S, "nothing was found"
+def _until(search: Callable[[], Found], label: str) -> Found:
+    until, reason = time.monotonic() + _PATIENCE_S, "nothing was found"
     while time.monotonic() < until:
         try:
-            if thing := found():
+            if thing := search():
                 return thing
         except (RuntimeFault, psutil.Error) as fault:
-            why = str(fault)
+            reason = str(fault)
         time.sleep(_LOOK_S)
-    raise SystemExit(f"{what}: not within {_PATIENCE_S:g} s: {why}")
+    raise SystemExit(f"{label}: not within {_PATIENCE_S:g} s: {reason}")
 
 
 def two_free_ports() -> int:

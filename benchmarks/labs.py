@@ -101,10 +101,10 @@ class ProcessorUsage:
         """
         seconds = time.monotonic() - self._begun
         now, before = self._times(), self._before
-        taken = {name: (used - before.get(name, 0.0)) / seconds * 100.0 for name, used in now.items()}
-        busy, ours = taken.pop("busy"), taken.pop("ours")
-        lab = sum(taken.values())
-        return {**taken, "lab": lab, "measuring": ours - lab, "others": busy - ours}
+        percents = {name: (used - before.get(name, 0.0)) / seconds * 100.0 for name, used in now.items()}
+        busy, measuring = percents.pop("busy"), percents.pop("ours")
+        lab = sum(percents.values())
+        return {**percents, "lab": lab, "measuring": measuring - lab, "others": busy - measuring}
 
     def _times(self) -> dict[str, float]:
         """Return the processor time of the lab's processes by name, of all our processes, and of the machine [s]."""
@@ -119,14 +119,14 @@ class ProcessorUsage:
 
 def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
     """Return user and system time by program [s]."""
-    found: dict[str, float] = {}
+    usage: dict[str, float] = {}
     for process in processes:
         try:
             name, times = named(process.cmdline()), process.cpu_times()
         except psutil.NoSuchProcess:  # it has ended since it was listed
             continue
-        found[name] = found.get(name, 0.0) + times.user + times.system
-    return found
+        usage[name] = usage.get(name, 0.0) + times.user + times.system
+    return usage
 
 
 class Scheduling:
@@ -183,8 +183,8 @@ def set_up(page: LivePage) -> Mapping[str, Any]:
 def only_episode(data: Path, seconds: float = 30.0) -> Episode:
     """Return the only episode of a data folder as soon as it is closed."""
     deadline = time.monotonic() + seconds
-    while not (found := list(data.glob("episodes/*/outcome.json"))):
+    while not (outcomes := list(data.glob("episodes/*/outcome.json"))):
         if time.monotonic() > deadline:
             raise SystemExit(f"no episode was closed in {data} within {seconds:g} s")
         time.sleep(0.1)
-    return open_episode(found[0].parent)
+    return open_episode(outcomes[0].parent)

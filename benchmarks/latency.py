@@ -67,10 +67,10 @@ class PressingPage(LivePage):
         with self._answered:
             if not self._answered.wait_for(lambda: identity in self._answers, _ACK_S):
                 raise DemoFailed(f"{kind}: no answer within {_ACK_S:g} s")
-            answered, status = self._answers[identity]
+            answered_at, status = self._answers[identity]
         if status not in ("accepted", "done"):
             raise DemoFailed(f"{kind} was {status}")
-        return pressed, answered
+        return pressed, answered_at
 
     def _on_message(self, message: Mapping[str, Any]) -> None:
         now = time.monotonic()
@@ -104,13 +104,13 @@ def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
         settings = ["control.rate=30.0", "recording.fps=30.0", *assignments]
         with busy_lab(Path(folder), settings) as lab:
             transit = _shortest_delay(lab.announced["node"])
-            found, presses, percent = _run(lab, seconds)
+            latencies, presses, percent = _run(lab, seconds)
             episode = only_episode(lab.data)
-        measured = {**found, **_from(episode, presses, transit)}
+        measured = {**latencies, **_from(episode, presses, transit)}
     figures = [
         Figure(name, value, "ms", _WANTED.get(name, ""))
-        for way, values in measured.items()
-        for name, value in _percentiles(way, values)
+        for route, values in measured.items()
+        for name, value in _percentiles(route, values)
     ]
     figures += [
         Figure("halts", len(presses), ""),
@@ -135,9 +135,9 @@ def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], 
         page.renewals.clear()
         processors, end = ProcessorUsage(lab.process), time.monotonic() + seconds
         while time.monotonic() < end:
-            pressed, answered = page.press("halt")
+            pressed, answered_at = page.press("halt")
             presses.append(pressed)
-            commands.append(answered - pressed)
+            commands.append(answered_at - pressed)
             page.wait(lambda state: state["state_is"]["held"], 10.0, "halting")
             resumes.append(_resume(page))
             time.sleep(_RUNS_S)
@@ -145,21 +145,21 @@ def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], 
         page.command("stop")
         page.wait(lambda state: state["state_is"]["ready"], 20.0, "stopping")
         watching.communicate()
-    ways = {"command_ms": commands, "renew_ms": renewals, "rest_ms": resumes}
-    return {name: _ms(values) for name, values in ways.items()}, presses, percent
+    by_route = {"command_ms": commands, "renew_ms": renewals, "rest_ms": resumes}
+    return {name: _ms(values) for name, values in by_route.items()}, presses, percent
 
 
 def _resume(page: LivePage) -> float:
     begun = time.monotonic()
     page.command("resume")
-    taken = time.monotonic() - begun
+    delay = time.monotonic() - begun
     page.wait(lambda state: state["state_is"]["going"], 10.0, "resuming")
-    return taken
+    return delay
 
 
 def _shortest_delay(endpoint: str) -> float:
     """Return the shortest time from the node's stamp to a subscriber in this process [s]."""
-    ways = []
+    delays = []
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.SUBSCRIBE, b"")
         socket.setsockopt(zmq.RCVHWM, 2)
@@ -170,10 +170,10 @@ def _shortest_delay(endpoint: str) -> float:
             if socket.poll(int(left * 1000)):
                 payload = socket.recv()
                 arrived = time.monotonic()
-                ways.append(arrived - float(msgpack_arrays.unpack(payload)["t"]))
-    if not ways:
+                delays.append(arrived - float(msgpack_arrays.unpack(payload)["t"]))
+    if not delays:
         raise SystemExit(f"the node at {endpoint} says nothing")
-    return min(ways)
+    return min(delays)
 
 
 def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[str, Any]:
@@ -194,8 +194,8 @@ def _to_the_node(episode: Episode, presses: Sequence[float]) -> list[float]:
     """Return the time from each press to the first command after it that does not come from the policy [s]."""
     ticks = episode.ticks
     sent = ticks.column("sent").to_numpy() + episode.manifest["started_monotonic"]
-    ours = np.array(ticks.column("control_source").to_pylist()) != "policy"
-    changed = sent[ours]
+    local = np.array(ticks.column("control_source").to_pylist()) != "policy"
+    changed = sent[local]
     return [float(changed[np.searchsorted(changed, pressed)] - pressed) for pressed in presses]
 
 
@@ -203,10 +203,10 @@ def _ms(seconds: Sequence[float]) -> np.ndarray:
     return np.array(seconds) * 1000.0
 
 
-def _percentiles(way: str, values: Any) -> list[tuple[str, float]]:
+def _percentiles(route: str, values: Any) -> list[tuple[str, float]]:
     if isinstance(values, Mapping):
-        return [(f"{way}.{name}", float(value)) for name, value in values.items()]
+        return [(f"{route}.{name}", float(value)) for name, value in values.items()]
     return [
-        (f"{way}.{name}", float(np.percentile(values, q)))
+        (f"{route}.{name}", float(np.percentile(values, q)))
         for name, q in (("p50", 50.0), ("p99", 99.0), ("max", 100.0))
     ]

@@ -22,7 +22,7 @@ def main() -> int:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ready_file", type=Path)
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
     from evaweb.lab.lab import open_lab
@@ -32,7 +32,7 @@ def main() -> int:
         with open_lab("127.0.0.1", 0) as lab:
             url = lab.start([])
             pids = lab.processes.pids()
-            _announce(given.ready_file, url, lab.stops, pids)
+            _announce(options.ready_file, url, lab.stops, pids)
             lab.watch()
     except StopRequested:
         return 0
@@ -51,8 +51,8 @@ def _announce(ready_file: Path, url: str, stops: str, pids: dict[str, int]) -> N
     admin, enrol = User.objects.get(username=Role.ADMIN), {}
     for name in STATIONS:
         station = station_registered(name=name, robot=_ROBOT, deployment="", simulated=True)
-        shown = code_make(user=admin, station=station)
-        enrol[name] = [shown.address, shown.code]
+        enrolment = code_make(user=admin, station=station)
+        enrol[name] = [enrolment.address, enrolment.code]
     passwords = {login.username: login.password for login in logins}
     announce_ready(
         {"url": url, "stops": stops, "passwords": passwords, "enrol": enrol, "pids": pids}, ready_file

@@ -46,7 +46,7 @@ def measure(seconds: float) -> Report:
         Figure("lateness_p99_ms.alone", alone["control"]["lateness_p99_ms"], "ms"),
         Figure("missed_ticks", watched["control"]["missed"] - alone["control"]["missed"], "", "== 0"),
     ]
-    rows = [{"viewers": n, **found["control"]} for n, found in ((0, alone), (_VIEWERS, watched))]
+    rows = [{"viewers": n, **measured["control"]} for n, measured in ((0, alone), (_VIEWERS, watched))]
     return Report("live", figures, rows)
 
 
@@ -54,13 +54,13 @@ def _run(visitor: RestClient, seconds: float, viewers: int) -> Mapping[str, Any]
     """Run one trial for `seconds` with `viewers` viewers, and void it afterwards."""
     with closing(LivePage(visitor, STATION)) as page:
         trial = start(visitor, page, TrialChoice(STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
-        found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
+        viewed = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
         state = page.wait(lambda state: True, 10, "looking")
         page.command("stop")
         page.wait(lambda state: state["state_is"]["ready"], 10, "stopping")
         visitor.post(f"stations/{STATION}/lease", {"action": "give_up", "page": page.page})
     _void(visitor, trial)
-    return {**found, "control": state["control"]}
+    return {**viewed, "control": state["control"]}
 
 
 def _wait(seconds: float) -> dict[str, Any]:
@@ -76,8 +76,8 @@ def _void(visitor: RestClient, trial: int) -> None:
 
 def _viewers(visitor: RestClient, seconds: float, **counts: int) -> dict[str, Any]:
     child = watch(visitor, seconds, STATION, **counts)
-    found: dict[str, Any] = json.loads(child.communicate()[0])
-    return found
+    result: dict[str, Any] = json.loads(child.communicate()[0])
+    return result
 
 
 def _stalled(visitor: RestClient, web: int, seconds: float) -> float:

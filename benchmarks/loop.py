@@ -59,10 +59,10 @@ def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
 def _figures(row: Mapping[str, Any]) -> list[Figure]:
     name, fifo = f"{row['rate']:g}", str(row["scheduling"]).startswith("FIFO")
     late = row["lateness_ms"]
-    busy = sum(row["cpu_percent"][who] for who in ("lab", "measuring", "others"))
-    wanted = {"p99": "<= 0.5", "p999": "<= 3"} if fifo else {"p99": "<= 2" if busy < _SATURATED else ""}
+    busy = sum(row["cpu_percent"][usage] for usage in ("lab", "measuring", "others"))
+    allowed = {"p99": "<= 0.5", "p999": "<= 3"} if fifo else {"p99": "<= 2" if busy < _SATURATED else ""}
     return [
-        *(Figure(f"lateness_{q}_ms.{name}", late[q], "ms", wanted.get(q, "")) for q in _QUANTILES),
+        *(Figure(f"lateness_{q}_ms.{name}", late[q], "ms", allowed.get(q, "")) for q in _QUANTILES),
         Figure(f"missed_ticks.{name}", row["missed"], "", "== 0" if fifo else ""),
         Figure(f"effective_rate_hz.{name}", row["effective_rate_hz"], "Hz"),
         Figure(f"rate_error_ppm.{name}", abs(row["rate_error_ppm"]), "ppm", "<= 100" if fifo else ""),
@@ -83,9 +83,9 @@ def case(rate: float, seconds: float, assignments: Sequence[str], without: str =
         with busy_lab(Path(folder), settings, without) as lab:
             priority = [] if "control.realtime=off" in assignments else [str(_PRIORITY)]
             sleepers = [["deadlines", str(rate), str(seconds), *priority], ["rest", str(rate), str(seconds)]]
-            state, beside, used = _run(lab, sleepers, seconds)
+            state, references, used = _run(lab, sleepers, seconds)
             episode = only_episode(lab.data)
-        return {"rate": rate, **used, **_judged(episode, rate, state["control"], beside)}
+        return {"rate": rate, **used, **_judged(episode, rate, state["control"], references)}
 
 
 def _run(
@@ -107,8 +107,8 @@ def _run(
         watching.communicate()
     if not state["state_is"]["ready"]:
         raise SystemExit(f"the run ended {state['state']}: {state['reason']}")
-    beside = [json.loads(loop.communicate()[0]) for loop in loops]
-    return state, beside, {"cpu_percent": percent, "scheduled": scheduled}
+    references = [json.loads(loop.communicate()[0]) for loop in loops]
+    return state, references, {"cpu_percent": percent, "scheduled": scheduled}
 
 
 def _sleeper(arguments: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
@@ -118,25 +118,25 @@ def _sleeper(arguments: Sequence[str], environment: Mapping[str, str]) -> subpro
 
 
 def _judged(
-    episode: Episode, rate: float, control: Mapping[str, Any], beside: Sequence[Any]
+    episode: Episode, rate: float, control: Mapping[str, Any], references: Sequence[Any]
 ) -> dict[str, Any]:
-    table, (bare, common) = episode.ticks, beside
+    table, (bare, common) = episode.ticks, references
     steps, planned, woke, sent = (
         table.column(name).to_numpy() for name in ("step", "planned", "woke", "sent")
     )
     skipped = np.diff(steps, prepend=steps[0] - 1) - 1
     late = woke - planned + skipped / rate  # a tick after a gap was due when the gap began
-    ours, floor = _spread(late), _spread(np.array(bare["late"]))
+    own, floor = _spread(late), _spread(np.array(bare["late"]))
     assert episode.outcome is not None
     outcome: Mapping[str, Any] = episode.outcome
     return {
         "ticks": len(steps),
         "scheduling": control["scheduling"],
-        "lateness_ms": ours,
+        "lateness_ms": own,
         "sent_ms": _spread(sent - planned),
         "missed": int(skipped.sum()),
         **_rate(steps, sent, rate),
-        "ratio": ours["p99"] / floor["p99"],
+        "ratio": own["p99"] / floor["p99"],
         "bare": {"scheduling": bare["scheduling"], "lateness_ms": floor},
         "sleep_rate_error_ppm": _rate(np.array(common["steps"]), np.array(common["woke"]), rate)[
             "rate_error_ppm"
@@ -154,5 +154,5 @@ def _spread(seconds: Times) -> dict[str, float]:
 
 def _rate(steps: Steps, times: Times, rate: float) -> dict[str, float]:
     """Return the rate fitted to `times` of `steps`, and its deviation from `rate` [ppm]."""
-    found = 1.0 / float(np.polyfit(steps, times, 1)[0])
-    return {"effective_rate_hz": found, "rate_error_ppm": (found / rate - 1.0) * 1e6}
+    rate_hz = 1.0 / float(np.polyfit(steps, times, 1)[0])
+    return {"effective_rate_hz": rate_hz, "rate_error_ppm": (rate_hz / rate - 1.0) * 1e6}

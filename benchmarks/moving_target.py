@@ -93,11 +93,11 @@ def table(seconds_budget: float) -> list[dict[str, Any]]:
     machine.
     """
     seeds = range(max(SEEDS, int(seconds_budget / _PER_SEED_S)))
-    asked = list(product(STRATEGIES, DELAYS, seeds))
+    cases = list(product(STRATEGIES, DELAYS, seeds))
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        episodes = list(pool.map(_chased, asked))
+        episodes = list(pool.map(_chased, cases))
     return [
-        _row([one for one in episodes if (one.strategy, one.delay) == cell])
+        _row([episode for episode in episodes if (episode.strategy, episode.delay) == cell])
         for cell in product(STRATEGIES, DELAYS)
     ]
 
@@ -107,16 +107,17 @@ def _row(episodes: list[ChaseResult]) -> dict[str, Any]:
     figures = {"success_rate": "success", "on_target": "share", "mean_mm": "mean", "p95_mm": "p95"}
     figures["acceleration_p95"] = "acceleration"
     means = {
-        name: float(np.mean([getattr(one, field) for one in episodes])) for name, field in figures.items()
+        name: float(np.mean([getattr(episode, field) for episode in episodes]))
+        for name, field in figures.items()
     }
-    shares = [round(one.share, 4) for one in episodes]
-    held = sum(one.state != SessionState.RUNNING for one in episodes)
+    shares = [round(episode.share, 4) for episode in episodes]
+    held_runs = sum(episode.state != SessionState.RUNNING for episode in episodes)
     row = {"strategy": first.strategy, "delay": first.delay, "episodes": len(episodes), **means}
-    return row | {"shares": shares, "held": held}
+    return row | {"shares": shares, "held": held_runs}
 
 
-def _chased(asked: tuple[str, int, int]) -> ChaseResult:
-    strategy, delay, seed = asked
+def _chased(chase: tuple[str, int, int]) -> ChaseResult:
+    strategy, delay, seed = chase
     return run_chase({"kind": strategy, **STRATEGIES[strategy]}, delay, seed)
 
 
@@ -124,8 +125,8 @@ def run_chase(strategy: Mapping[str, Any], delay: int, seed: int) -> ChaseResult
     """Run one episode in lockstep to the end of the belt's motion; its share is 0 if the motion never begins."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
-        course, made = station_at(Path(folder), strategy, delay, seed)
-        with closing(made) as station:
+        course, built = station_at(Path(folder), strategy, delay, seed)
+        with closing(built) as station:
             commanded = _follow(station, course)
             state, rate = str(station.coordinator.session.state), station.spec.rate
     escort = course.escort

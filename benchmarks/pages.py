@@ -202,8 +202,10 @@ def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS) -> Report:
         _seed(folder / "data", plans, trials)
         ready = folder / "ready.json"
         with lab(["manage.py", "demo", "--port", "0", "--ready-file", str(ready)], ready) as demo:
-            done = run_one_trial(demo.visitor, TrialChoice(STATION, "block-on-plate", 1, "pick-place-40k", 1))
-            rows, sought = _visits(demo, pages(done.episode, done.trial))
+            played = run_one_trial(
+                demo.visitor, TrialChoice(STATION, "block-on-plate", 1, "pick-place-40k", 1)
+            )
+            rows, sought = _visits(demo, pages(played.episode, played.trial))
     return Report("pages", [*figures(rows), Figure("seek_ms", sought, "ms", "<= 150")], rows)
 
 
@@ -237,8 +239,8 @@ def _seed(data: Path, plans: int, trials: int) -> None:
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=variables, check=True)
 
 
-def _visits(demo: RunningLab, wanted: Sequence[Page]) -> tuple[list[dict[str, Any]], float]:
-    """Return a row per load of the pages `wanted`, and the median duration of a seek in the episode [ms]."""
+def _visits(demo: RunningLab, listed: Sequence[Page]) -> tuple[list[dict[str, Any]], float]:
+    """Return a row per load of the pages `listed`, and the median duration of a seek in the episode [ms]."""
     from playwright.sync_api import sync_playwright
 
     url = demo.announced["url"]
@@ -247,13 +249,13 @@ def _visits(demo: RunningLab, wanted: Sequence[Page]) -> tuple[list[dict[str, An
             executable_path=shutil.which("chromium") or "/usr/bin/chromium",
             args=["--no-sandbox", "--enable-unsafe-swiftshader"],
         )
-        known = _login(browser, url, demo.announced["passwords"]["admin"])
+        session = _login(browser, url, demo.announced["passwords"]["admin"])
 
         def fresh() -> Any:
-            return browser.new_context(storage_state=known, viewport=_VIEWPORT).new_page()
+            return browser.new_context(storage_state=session, viewport=_VIEWPORT).new_page()
 
-        rows = [row for one in wanted for row in _loads(fresh, url, one)]
-        replay = next(one for one in wanted if one.name == "replay")
+        rows = [row for listed_page in listed for row in _loads(fresh, url, listed_page)]
+        replay = next(listed_page for listed_page in listed if listed_page.name == "replay")
         page = fresh()
         page.goto(url + replay.address)
         page.wait_for_function(_PLAYABLE)
@@ -272,24 +274,24 @@ def _login(browser: Any, url: str, password: str) -> Any:
     return page.context.storage_state()
 
 
-def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[str, Any]]:
+def _loads(fresh: Callable[[], Any], url: str, target: Page) -> Iterator[dict[str, Any]]:
     """Yield a row for each of five loads of a page after a warm-up; the last load is checked by axe-core in both
     themes.
     """
     for load in range(LOADS + 1):
         page = fresh()
         page.add_init_script(_WATCH)
-        page.goto(url + wanted.address, wait_until="load")
+        page.goto(url + target.address, wait_until="load")
         page.wait_for_timeout(_LATER_MS)
         kb = page.evaluate(_KB)
-        for control in wanted.controls:
+        for control in target.controls:
             control(page)
             page.evaluate(_PAINTED)
-        row = page.evaluate("seen") | {"page": wanted.name, "draws": wanted.draws, "kb": kb, "axe": []}
+        row = page.evaluate("seen") | {"page": target.name, "draws": target.draws, "kb": kb, "axe": []}
         if load == LOADS:
             page.evaluate(_AXE.read_text("utf-8"))
             row["axe"] = [fault for theme in ("dark", "light") for fault in page.evaluate(_FOUND, theme)]
-        for selector in wanted.onward:
+        for selector in target.onward:
             with page.expect_event("load"):
                 page.locator(selector).first.click()
             row["inp"] = page.evaluate("seen.inp")  # includes events of the previous page

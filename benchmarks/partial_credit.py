@@ -57,29 +57,29 @@ def measure(seconds: float) -> Report:
         runs = reached.tolist()
         stops = {
             "ours": [
-                score_evidence([(scores[one], scores[other]) for one, other in run]).stop for run in runs
+                score_evidence([(scores[left], scores[right]) for left, right in run]).stop for run in runs
             ]
         }
         if PEER.exists():
             stops["nscore"] = _asked({"runs": runs, "alpha": ALPHA, "scores": scores})
-        for who, found in stops.items():
-            figures += _figures(f"{who}.{chances[0]}.{chances[1]}", found, equal=chances[0] == chances[1])
-            rows.append({"who": who, "chances": chances, "stops": found})
+        for rule, ends in stops.items():
+            figures += _figures(f"{rule}.{chances[0]}.{chances[1]}", ends, equal=chances[0] == chances[1])
+            rows.append({"who": rule, "chances": chances, "stops": ends})
     if not PEER.exists():
         print(f"{PEER} does not exist: NSCORE is left out (see {__file__})", file=sys.stderr)
     return Report("partial_credit", figures, rows)
 
 
-def _asked(given: dict[str, object]) -> list[int | None]:
-    done = subprocess.run(
-        [str(PEER), "-c", _ASKED], input=json.dumps(given), capture_output=True, text=True, check=True
+def _asked(question: dict[str, object]) -> list[int | None]:
+    completed = subprocess.run(
+        [str(PEER), "-c", _ASKED], input=json.dumps(question), capture_output=True, text=True, check=True
     )
-    return list(json.loads(done.stdout))
+    return list(json.loads(completed.stdout))
 
 
 def _figures(of: str, stops: Sequence[int | None], equal: bool) -> Iterator[Figure]:
     share = sum(stop is not None for stop in stops) / len(stops)
-    ours = equal and of.startswith("ours")
+    own = equal and of.startswith("ours")
     allowed = ALPHA + 3 * (ALPHA * (1 - ALPHA) / len(stops)) ** 0.5
-    yield Figure(f"found.{of}", share, "", f"<= {allowed:.4f}" if ours else "")
+    yield Figure(f"found.{of}", share, "", f"<= {allowed:.4f}" if own else "")
     yield Figure(f"pairs.{of}", float(np.median([stop or PAIRS for stop in stops])), "")

@@ -51,16 +51,16 @@ def measure(seconds: float, long: bool = False) -> Report:
         station = _timed(recording_station.record, _made(folder / "station"), _LONG_S if long else seconds)
         busy = _timed(recording_busy.record, _made(folder / "busy"), _LONG_BUSY_S if long else seconds)
         frames = recording_frames.write(folder / "frames.npy")
-        beside = _timed(_beside, folder, frames)
+        compared = _timed(_beside, folder, frames)
         kills = _timed(_kills, folder, frames, long, seed)
         listing = _timed(_listing, _made(folder / "listing"))
     return Report(
         "recording",
-        figures(station, busy, beside, kills, listing),
+        figures(station, busy, compared, kills, listing),
         [
             {"part": "station", **station},
             {"part": "busy", **busy},
-            {"part": "beside", **beside},
+            {"part": "beside", **compared},
             {"part": "kills", "seed": seed, **kills},
             {"part": "listing", **listing},
         ],
@@ -115,18 +115,18 @@ def figures(
 
 def _ratios(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
     """Return LeRobot's processor time per recorded frame as a multiple of ours; both include writing the dataset."""
-    (ours,) = (row for row in rows if row["writer"] == "ours")
+    (own,) = (row for row in rows if row["writer"] == "ours")
     per_frame = {row["writer"]: (row["capture_cpu_s"] + row["save_cpu_s"]) / row["frames"] for row in rows}
-    found = [
+    ratios = [
         Figure(f"cpu_ms_per_frame.{writer}", value * 1000.0, "ms") for writer, value in per_frame.items()
     ]
     for row in rows:
-        if row is not ours:
-            found += [
+        if row is not own:
+            ratios += [
                 Figure(f"cpu_ratio.{row['writer']}", per_frame[row["writer"]] / per_frame["ours"], "x"),
-                Figure(f"save_ratio.{row['writer']}", row["save_s"] / ours["save_s"], "x"),
+                Figure(f"save_ratio.{row['writer']}", row["save_s"] / own["save_s"], "x"),
             ]
-    return found
+    return ratios
 
 
 def _made(folder: Path) -> Path:
@@ -138,8 +138,8 @@ def _timed(part: Any, *arguments: Any) -> dict[str, Any]:
     """Return the results of a part, with the part's duration and the machine's load at its end."""
     begun = time.monotonic()
     print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # progress, because it takes minutes
-    found = part(*arguments)
-    return {**found, "took_s": time.monotonic() - begun, "load": os.getloadavg()}
+    measured = part(*arguments)
+    return {**measured, "took_s": time.monotonic() - begun, "load": os.getloadavg()}
 
 
 def _beside(folder: Path, frames: Path) -> dict[str, Any]:
@@ -149,8 +149,8 @@ def _beside(folder: Path, frames: Path) -> dict[str, Any]:
     for number, python in enumerate(interpreters()):
         for mode in _MODES:
             where = str(folder / f"lerobot_{number}_{mode}")
-            found = _child(python, "recording_lerobot", str(frames), count, where, mode)
-            rows.append({"writer": f"lerobot_{found['version']}_{mode}", **found})
+            measured = _child(python, "recording_lerobot", str(frames), count, where, mode)
+            rows.append({"writer": f"lerobot_{measured['version']}_{mode}", **measured})
     return {"rows": rows}
 
 
@@ -159,14 +159,16 @@ def interpreters() -> list[str]:
     named = [path for path in os.environ.get("EVA_LEROBOT_PYTHONS", "").split(":") if path]
     if find_spec("lerobot") is not None:
         named.append(sys.executable)
-    asked = "from importlib.metadata import version; print(version('lerobot'))"
+    program = "from importlib.metadata import version; print(version('lerobot'))"
     versions = {
         path: subprocess.run(
-            [path, "-c", asked], stdout=subprocess.PIPE, text=True, check=True
+            [path, "-c", program], stdout=subprocess.PIPE, text=True, check=True
         ).stdout.strip()
         for path in named
     }
-    return [path for path, told in versions.items() if tuple(map(int, told.split(".")[:3])) >= (0, 4, 4)]
+    return [
+        path for path, release in versions.items() if tuple(map(int, release.split(".")[:3])) >= (0, 4, 4)
+    ]
 
 
 def _child(python: str, module: str, *arguments: str, **environment: str) -> dict[str, Any]:
@@ -175,13 +177,13 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
     If it fails, exit with its complete error output.
     """
     command = [python, "-m", f"benchmarks.{module}", *arguments]
-    done = subprocess.run(
+    completed = subprocess.run(
         command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
     )
-    if done.returncode != 0:
-        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}: {done.stderr[-3000:]}")
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    if completed.returncode != 0:
+        raise SystemExit(f"{' '.join(command)} ended with {completed.returncode}: {completed.stderr[-3000:]}")
+    result: dict[str, Any] = json.loads(completed.stdout.splitlines()[-1])
+    return result
 
 
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:

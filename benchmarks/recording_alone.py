@@ -47,19 +47,19 @@ def manifest() -> dict[str, Any]:
 
 def append(journal: EpisodeJournal, index: int, pictures: dict[str, Any]) -> None:
     """Append row `index` with its images and ticks."""
-    now, here = time.monotonic(), joints(index)
+    now, position = time.monotonic(), joints(index)
     captured = dict.fromkeys(("joints", *CAMERAS), now)
-    journal.append(Row(index, index * _TICKS, now, index, here, here, captured, pictures, "policy"))
+    journal.append(Row(index, index * _TICKS, now, index, position, position, captured, pictures, "policy"))
     for step in range(index * _TICKS, (index + 1) * _TICKS):
-        journal.append(ExecutedTick(step, 1, now, now, index, "policy", here, here, here))
+        journal.append(ExecutedTick(step, 1, now, now, index, "policy", position, position, position))
 
 
 def main(path: str, count: str, folder: str) -> None:
     """Record an episode of `count` frames from `path` in `folder`, publish it, and print the cost."""
     root = Path(folder)
     journal = EpisodeJournal(root / "episodes", RecordingSettings(min_free_bytes=0))
-    journal.begin(told := manifest())
-    given = feed_frames(
+    journal.begin(header := manifest())
+    fed = feed_frames(
         Frames(Path(path)), int(count), lambda index, pictures: append(journal, index, pictures)
     )
     closed: list[float] = []
@@ -68,10 +68,10 @@ def main(path: str, count: str, folder: str) -> None:
         begun = time.monotonic()
         journal.end(Outcome("finished", "the frames have ended", time.time()))
         closed.append(time.monotonic() - begun)
-        publish(root / "episodes" / told["uuid"], root / "dataset")
+        publish(root / "episodes" / header["uuid"], root / "dataset")
 
-    written = finish(given, save, root / "dataset")
-    outcome = json.loads((root / "episodes" / told["uuid"] / "outcome.json").read_text("utf-8"))
+    written = finish(fed, save, root / "dataset")
+    outcome = json.loads((root / "episodes" / header["uuid"] / "outcome.json").read_text("utf-8"))
     lost = sum(outcome["repeated"].values()) + 3 * (int(count) - outcome["frames"])
     print(json.dumps({**written.fields(), "closed_s": closed[0], "lost": lost}))
 

@@ -56,7 +56,7 @@ def _run(lab: PatientLab, seconds: float, busy: bool) -> dict[str, Any]:
     lab.client.command("run")
     uuid = lab.client.wait(lambda status: status["recording"]["uuid"], 2 * PATIENCE_S)["recording"]["uuid"]
     with _loops(os.cpu_count() or 1 if busy else 0):
-        ages, held = _watch(lab, seconds)
+        ages, reasons = _watch(lab, seconds)
         status = lab.client.status()
     lab.client.command("stop")
     lab.reach("ready", "idle")
@@ -66,7 +66,7 @@ def _run(lab: PatientLab, seconds: float, busy: bool) -> dict[str, Any]:
         "seconds": seconds,
         "scheduling": status["link"]["scheduling"],
         "age_ms": {quantile: max(age[quantile] for age in ages) for quantile in ages[0]},
-        "holds": held,
+        "holds": reasons,
         **pictures(episode),
     }
 
@@ -75,12 +75,12 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
     """Return the ages of joints at intervals, and the reasons for holds; a run that holds is resumed."""
     end, look_at = time.monotonic() + seconds, time.monotonic() + _LOOK_S
     ages: list[dict[str, float]] = []
-    held: list[str] = []
+    reasons: list[str] = []
     while (now := time.monotonic()) < end or not ages:
         lab.client.renew()
         status = lab.client.status(30.0)
         if not status["state_is"]["going"]:
-            held.append(status["reason"])
+            reasons.append(status["reason"])
         if status["state_is"]["held"]:
             with suppress(Refused):  # not possible yet: retried at the next poll
                 lab.client.command("resume")
@@ -88,7 +88,7 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
             look_at = now + _LOOK_S
             ages.append(status["link"]["age_ms"])
         time.sleep(0.5)
-    return ages, held
+    return ages, reasons
 
 
 def pictures(episode: Episode) -> dict[str, int]:
@@ -100,7 +100,7 @@ def pictures(episode: Episode) -> dict[str, int]:
     rows = episode.rows
     for camera in episode.layout.cameras:
         captured = rows.column(f"capture_time.{camera}").to_numpy()
-        repeated, lost = (rows.column(f"{what}.{camera}").to_numpy() for what in ("repeated", "lost"))
+        repeated, lost = (rows.column(f"{mark}.{camera}").to_numpy() for mark in ("repeated", "lost"))
         new = np.concatenate([[True], captured[1:] != captured[:-1]])
         flagged += int(lost.sum())
         silent += int((repeated & new & ~lost).sum())

@@ -25,8 +25,8 @@ def main() -> None:
     call_command("migrate", verbosity=0)
     reconcile()
     closed = Episode.objects.filter(status=EpisodeStatus.FINISHED, frames__gt=0)
-    asked = [str(episode.uuid) for episode in closed if request_publish(episode=episode)]
-    json.dump(asked, sys.stdout)
+    requested = [str(episode.uuid) for episode in closed if request_publish(episode=episode)]
+    json.dump(requested, sys.stdout)
 
 
 if __name__ == "__main__":

@@ -140,7 +140,7 @@ def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
         "EVA_LOG_LEVEL": "ERROR",
         "EVA_JOB_STALE_S": "12",  # short, because the benchmark waits until a dead worker's job is reclaimed
     }
-    asked = _ask(environment)
+    requested = _ask(environment)
     rows = []
     dead: set[str] = set()
     for moment in many.moments(seed, _WORKING_S):
@@ -149,13 +149,13 @@ def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
             time.sleep(moment)
             worker.kill()
         dead.add(owner)
-        found = {"job": job, "problems": _problems(data)}
-        rows.append({"process": "worker", "after_s": moment, "lost_s": 0.0, **found})
+        measured = {"job": job, "problems": _problems(data)}
+        rows.append({"process": "worker", "after_s": moment, "lost_s": 0.0, **measured})
         _ask(environment)
     with _worker(environment) as worker:
-        _published(data, worker, asked)
+        _published(data, worker, requested)
         worker.send_signal(signal.SIGTERM)
-    missing = _missing_s(data, asked)
+    missing = _missing_s(data, requested)
     rows.append({"process": "worker", "after_s": None, "lost_s": missing, "problems": _problems(data)})
     return rows
 
@@ -163,9 +163,11 @@ def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
 def _ask(environment: Mapping[str, str]) -> list[str]:
     """Enqueue the publication of every closed episode, also of those published already; return their uuids."""
     command = [sys.executable, "-m", "benchmarks.recording_jobs"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True, text=True)
-    found: list[str] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    completed = subprocess.run(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True, text=True
+    )
+    episodes: list[str] = json.loads(completed.stdout.splitlines()[-1])
+    return episodes
 
 
 @contextmanager
@@ -192,23 +194,23 @@ def _working(data: Path, worker: subprocess.Popen[bytes], dead: Collection[str])
     raise SystemExit(f"the worker took no job ({worker.poll()})")
 
 
-def _published(data: Path, worker: subprocess.Popen[bytes], asked: list[str]) -> None:
+def _published(data: Path, worker: subprocess.Popen[bytes], requested: list[str]) -> None:
     begun = time.monotonic()
     while _query(data, "select 1 from jobs_job where status in ('queued', 'running') limit 1"):
         if time.monotonic() - begun > _PUBLISHED_S or worker.poll() is not None:
-            raise SystemExit(f"the jobs of {len(asked)} episodes were not done within {_PUBLISHED_S:g} s")
+            raise SystemExit(f"the jobs of {len(requested)} episodes were not done within {_PUBLISHED_S:g} s")
         time.sleep(0.1)
 
 
-def _missing_s(data: Path, asked: list[str]) -> float:
+def _missing_s(data: Path, requested: list[str]) -> float:
     """Return the longest part of a recording that is missing in its dataset [s]; all of it if it is not published."""
     worst = 0.0
-    for uuid in asked:
+    for uuid in requested:
         episode = open_episode(data / "episodes" / uuid)
         query = f"select dataset, dataset_index from episodes_episode where uuid = '{uuid.replace('-', '')}'"
         ((dataset, index),) = _query(data, query)
-        there = open_dataset(data / dataset).entry(index).length if dataset else 0
-        worst = max(worst, (episode.frames - there) / episode.layout.fps)
+        published = open_dataset(data / dataset).entry(index).length if dataset else 0
+        worst = max(worst, (episode.frames - published) / episode.layout.fps)
     return worst
 
 
@@ -221,10 +223,10 @@ def _query(data: Path, query: str) -> list[Any]:
 def _problems(data: Path) -> list[str]:
     """Return sentences about datasets and episodes that cannot be opened as they are, before any repair."""
     datasets = [info.parents[1] for info in data.glob(f"datasets/**/{INFO}")]
-    found = [f"{dataset.name}: {said}" for dataset in datasets for said in check(dataset)]
+    problems = [f"{dataset.name}: {problem}" for dataset in datasets for problem in check(dataset)]
     for folder in data.glob("episodes/*"):
         try:
             open_episode(folder)
         except RecordingError as error:
-            found.append(str(error))
-    return found
+            problems.append(str(error))
+    return problems

@@ -33,16 +33,16 @@ def main(path: str, count: str, folder: str, mode: str) -> None:
     features = {"observation.state": vector, "action": vector}
     features |= {f"observation.images.{camera}": picture for camera in CAMERAS}
     root = Path(folder) / "dataset"
-    made = LeRobotDataset.create("eva/bench", FPS, features, root=root, robot_type="bench", **MODES[mode])
+    dataset = LeRobotDataset.create("eva/bench", FPS, features, root=root, robot_type="bench", **MODES[mode])
 
     def add(index: int, pictures: dict[str, Any]) -> None:
         images = {f"observation.images.{camera}": pixels for camera, pixels in pictures.items()}
-        here = joints(index)
-        made.add_frame({"observation.state": here, "action": here, "task": "wave", **images})
+        position = joints(index)
+        dataset.add_frame({"observation.state": position, "action": position, "task": "wave", **images})
 
     def save() -> None:
-        made.save_episode()
-        made.finalize()
+        dataset.save_episode()
+        dataset.finalize()
 
     written = finish(feed_frames(Frames(Path(path)), int(count), add), save, root)
     del operators

@@ -79,7 +79,7 @@ def _fill(count: int) -> None:
     drawn = random.Random(7)
     stations = [Station.objects.create(name=f"bench-{n}", robot="agilex_piper", title="") for n in (1, 2, 3)]
     now = timezone.now()
-    made = Episode.objects.bulk_create(
+    episodes = Episode.objects.bulk_create(
         Episode(
             station=drawn.choice(stations),
             status=drawn.choice(
@@ -99,7 +99,7 @@ def _fill(count: int) -> None:
         )
         for number in range(count)
     )
-    for episode in made:
+    for episode in episodes:
         preview_folder(episode.uuid).mkdir(parents=True)
 
 

@@ -100,5 +100,5 @@ def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> Rec
 
 def processor_s() -> float:
     """Return the processor time of this process and of its child processes that have ended [s]."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    used = [resource.getrusage(target) for target in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)

@@ -86,9 +86,9 @@ class Watch:
     def _poll(self) -> None:
         for video in self._folder.glob("*.mp4"):
             size = video.stat().st_size
-            seen = self.sizes.setdefault(video.stem, [])
-            if not seen or seen[-1][1] != size:
-                seen.append((time.monotonic(), size))
+            samples = self.sizes.setdefault(video.stem, [])
+            if not samples or samples[-1][1] != size:
+                samples.append((time.monotonic(), size))
 
 
 def resident_mb(process: psutil.Process) -> float:
@@ -133,7 +133,7 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
         missed = _missed(lab) - missed
     finally:
         lab.close()
-    found = open_episode(episode)
+    recorded = open_episode(episode)
     return {
         "seconds": seconds,
         "cpu_core_percent": (watch.processor + watch.receiving) / watch.seconds * 100.0,
@@ -145,12 +145,12 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
             "end": watch.memory[-1],
             "peak": max(watch.memory),
         },
-        **lost(found, missed),
-        "to_disk_ms": to_disk(found, watch.sizes),
-        "muxed_ms": found.outcome and found.outcome["muxed_ms"],
-        "skew": found.outcome and found.outcome["skew"],
+        **lost(recorded, missed),
+        "to_disk_ms": to_disk(recorded, watch.sizes),
+        "muxed_ms": recorded.outcome and recorded.outcome["muxed_ms"],
+        "skew": recorded.outcome and recorded.outcome["skew"],
         "stop_to_saved_s": saved,
-        **published(episode, folder / "dataset", found.frames),
+        **published(episode, folder / "dataset", recorded.frames),
     }
 
 
@@ -176,8 +176,8 @@ def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
         dropped += int((repeated & changed).sum())
         repeats += int((repeated & ~changed).sum())
     frames: Mapping[str, int] = outcome["video_frames"]  # type: ignore[assignment]
-    taken = int(outcome.get("rows", len(times)))  # type: ignore[call-overload]
-    short = sum(max(0, taken - frames[camera]) for camera in episode.layout.cameras)
+    row_count = int(outcome.get("rows", len(times)))  # type: ignore[call-overload]
+    short = sum(max(0, row_count - frames[camera]) for camera in episode.layout.cameras)
     steps = np.diff(rows.column("sequence").to_numpy())
     absent = max(0, expected - len(times)) + missed
     return {
@@ -198,7 +198,7 @@ def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> d
     The sizes of the files are observed from another process.
     """
     started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
-    taken: list[float] = []
+    delays_ms: list[float] = []
     for camera, video in episode.videos.items():
         times, grown = (np.array(column) for column in zip(*sizes[video.stem], strict=True))
         with av.open(str(video)) as container:
@@ -206,12 +206,12 @@ def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> d
         captured = episode.rows.column(f"capture_time.{camera}").to_numpy() + started
         repeated = episode.rows.column(f"repeated.{camera}").to_numpy()
         count = min(len(ends), len(captured))
-        seen = np.searchsorted(grown, ends[:count])  # first observation of at least that many bytes
-        known = (seen < len(times)) & np.isfinite(captured[:count]) & ~repeated[:count]
-        taken.extend((times[seen[known]] - captured[:count][known]) * 1000.0)
-    if not taken:
+        places = np.searchsorted(grown, ends[:count])  # first observation of at least that many bytes
+        usable = (places < len(times)) & np.isfinite(captured[:count]) & ~repeated[:count]
+        delays_ms.extend((times[places[usable]] - captured[:count][usable]) * 1000.0)
+    if not delays_ms:
         raise SystemExit(f"no frame of {episode.path} was seen to reach its file")
-    p50, p99, longest = (float(value) for value in np.percentile(taken, (50, 99, 100)))
+    p50, p99, longest = (float(value) for value in np.percentile(delays_ms, (50, 99, 100)))
     return {"p50": p50, "p99": p99, "max": longest}
 
 
@@ -226,7 +226,7 @@ def published(episode: Path, dataset: Path, frames: int) -> dict[str, Any]:
     for recorded in sorted(episode.glob("*.mp4")):
         (copied,) = dataset.glob(f"videos/**/*{recorded.stem}*/*.mp4")
         pairs = zip(_packets(recorded)[:frames], _packets(copied), strict=True)
-        differing += sum(one != other for one, other in pairs)
+        differing += sum(left != right for left, right in pairs)
     return {"publish_s": took, "publish_changed_frames": differing}
 
 

@@ -36,11 +36,11 @@ class Reference:
 
     def _waves(self, steps: Float64, order: int) -> Float64:
         turn = 2.0 * np.pi / self.rate
-        made = np.zeros((len(steps), DIM))
+        waves = np.zeros((len(steps), DIM))
         for amplitude, frequency in _WAVES:
             angle = turn * frequency * np.asarray(steps)[:, None] + frequency * 7.0 + _PHASES
-            made += amplitude * (np.cos(angle) * turn * frequency if order else np.sin(angle))
-        return made
+            waves += amplitude * (np.cos(angle) * turn * frequency if order else np.sin(angle))
+        return waves
 
 
 def chunks_of(table: Float64, horizon: int) -> IntendedRows:
@@ -73,8 +73,8 @@ def make_policy(meant: IntendedRows) -> Callable[[int, Conditioning | None], Flo
         if conditioning is None:
             return rows
         left = conditioning.remaining_rows.astype(np.float64)[: len(rows)]
-        kept = min(conditioning.predicted_delay, len(left))
-        after, _ = overlap_blend(left[kept:], rows[kept:], _SEAM)
-        return np.concatenate([left[:kept], after])
+        prefix_length = min(conditioning.predicted_delay, len(left))
+        after, _ = overlap_blend(left[prefix_length:], rows[prefix_length:], _SEAM)
+        return np.concatenate([left[:prefix_length], after])
 
     return policy

@@ -123,10 +123,10 @@ def _visits(url: str, password: str, episode: str, size: int) -> Iterator[dict[s
             page.add_init_script(_WATCH)
             page.goto(f"{url}/replay/{episode}/", wait_until="commit")
             page.wait_for_function("() => window.shownAt !== undefined", timeout=_SHOWN_MS)
-            shown, fetched = page.evaluate("[window.shownAt, window.fetched()]")
+            shown_at, fetched = page.evaluate("[window.shownAt, window.fetched()]")
             browser.close()
             if visit:
-                yield {"start_ms": shown, "fetched_share": fetched / size}
+                yield {"start_ms": shown_at, "fetched_share": fetched / size}
 
 
 def _median(rows: list[dict[str, Any]], name: str) -> float:

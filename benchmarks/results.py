@@ -64,8 +64,8 @@ def measure(
             if long:
                 with server(Path(folder) / "million") as url:
                     data = Path(folder) / "web_million"
-                    found = _measured(data, {"DATABASE_URL": url}, MANY_PLANS, MANY_TRIALS, COPIES)
-                    rows.append(found | {"database": "million"})
+                    measured = _measured(data, {"DATABASE_URL": url}, MANY_PLANS, MANY_TRIALS, COPIES)
+                    rows.append(measured | {"database": "million"})
     for row in rows:
         figures += database_figures(row)
     figures.append(Figure("export_rows_per_s", rows[0]["exports"]["evaluation_csv"], "1/s"))
@@ -79,59 +79,59 @@ def _measured(
     data.mkdir()
     out = data / "out.json"
     counts = {"--plans": plans, "--trials": trials, "--copies": copies}
-    words = [
+    arguments = [
         "-m",
         "benchmarks.results_pages",
         str(out),
-        *(str(word) for one in counts.items() for word in one),
+        *(str(word) for pair in counts.items() for word in pair),
     ]
     variables = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "ERROR"} | environment
     if "DATABASE_URL" not in environment:
         variables.pop("DATABASE_URL", None)
-    subprocess.run([sys.executable, *words], cwd=_ROOT, env=variables, check=True)
-    found: dict[str, Any] = json.loads(out.read_text("utf-8"))
-    return found
+    subprocess.run([sys.executable, *arguments], cwd=_ROOT, env=variables, check=True)
+    figures: dict[str, Any] = json.loads(out.read_text("utf-8"))
+    return figures
 
 
 def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
     """Yield the figures that were measured on one database."""
     name = row["database"]
     for page in PAGES:
-        found = row["pages"][page]
-        yield Figure(f"page_p50_ms.{page}.{name}", found["p50"], "ms")
-        wanted = MANY_WANTED_MS.get(page, WANTED_MS) if name == "million" else WANTED_MS
-        yield Figure(f"page_p95_ms.{page}.{name}", found["p95"], "ms", f"<= {wanted}")
-        yield Figure(f"page_first_p95_ms.{page}.{name}", found["cold_p95"], "ms")
-        yield Figure(f"queries.{page}.{name}", found["queries"], "", f"<= {MOST_QUERIES}")
-    for what, rate in row["exports"].items():
-        yield Figure(f"export_rows_per_s.{what}.{name}", rate, "1/s")
+        timings = row["pages"][page]
+        yield Figure(f"page_p50_ms.{page}.{name}", timings["p50"], "ms")
+        allowed = MANY_WANTED_MS.get(page, WANTED_MS) if name == "million" else WANTED_MS
+        yield Figure(f"page_p95_ms.{page}.{name}", timings["p95"], "ms", f"<= {allowed}")
+        yield Figure(f"page_first_p95_ms.{page}.{name}", timings["cold_p95"], "ms")
+        yield Figure(f"queries.{page}.{name}", timings["queries"], "", f"<= {MOST_QUERIES}")
+    for label, rate in row["exports"].items():
+        yield Figure(f"export_rows_per_s.{label}.{name}", rate, "1/s")
     handing = row["handing"]
-    for what in ("left", "twice", "codes_twice", "out_of_order"):
-        yield Figure(f"handing.{what}.{name}", handing[what], "", "== 0")
+    for label in ("left", "twice", "codes_twice", "out_of_order"):
+        yield Figure(f"handing.{label}.{name}", handing[label], "", "== 0")
     yield Figure(f"handing.locked.{name}", handing["locked"], "")
     yield Figure(f"handing.p95_ms.{name}", handing["p95_ms"], "ms")
-    for what, value in row["planner"].items():
-        yield Figure(f"planner.{what}.{name}", value, "ms" if what.endswith("ms") else "")
+    for label, value in row["planner"].items():
+        yield Figure(f"planner.{label}.{name}", value, "ms" if label.endswith("ms") else "")
 
 
 def rule_figures(runs: int) -> Iterator[Figure]:
     """Yield how often the stopping rule, and a reader who tests at every look, separate equal checkpoints."""
     for rate in RATES:
         chance = random.Random(f"{rate}")
-        found = naive = 0
+        false_positives = naive = 0
         for _ in range(runs):
             pairs = [(chance.random() < rate, chance.random() < rate) for _ in range(PAIRS)]
-            found += success_evidence(pairs, ALPHA).stop is not None
+            false_positives += success_evidence(pairs, ALPHA).stop is not None
             naive += _peeked(pairs)
-        yield Figure(f"false_positive_rate.{rate:g}", found / runs, "", f"<= {ALPHA}")
+        yield Figure(f"false_positive_rate.{rate:g}", false_positives / runs, "", f"<= {ALPHA}")
         yield Figure(f"naive_false_positive_rate.{rate:g}", naive / runs, "")
 
 
 def _peeked(pairs: list[tuple[bool, bool]]) -> bool:
     """Return True if a fixed-size test of two pooled proportions is significant at any of the looks."""
     x1 = x2 = 0
-    for n, (one, other) in enumerate(pairs, start=1):
-        x1, x2 = x1 + one, x2 + other
+    for n, (left, right) in enumerate(pairs, start=1):
+        x1, x2 = x1 + left, x2 + right
         pooled = (x1 + x2) / (2 * n)
         spread = math.sqrt(2 * pooled * (1 - pooled) / n)
         if n >= FIRST_LOOK and spread and math.erfc(abs(x1 - x2) / n / spread / math.sqrt(2)) <= ALPHA:

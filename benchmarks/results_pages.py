@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=100_000)
     parser.add_argument("--copies", type=int, default=1, help="of each evaluation; PostgreSQL alone")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     import django
 
@@ -46,20 +46,20 @@ def main() -> None:
     setup_test_environment()
     call_command("migrate", verbosity=0)
     began = time.perf_counter()
-    seeded = seed(given.plans, given.trials)
-    if given.copies > 1:
-        seeded = multiplied(seeded, given.copies)
+    seeded = seed(options.plans, options.trials)
+    if options.copies > 1:
+        seeded = multiplied(seeded, options.copies)
     with connection.cursor() as cursor:
         cursor.execute("ANALYZE")
-    found = {
+    measured = {
         "database": connection.vendor,
         "seed_s": time.perf_counter() - began,
-        "pages": pages(seeded, given.rounds),
+        "pages": pages(seeded, options.rounds),
         "exports": exports(seeded),
         "handing": measure_allocation(seeded),
         "planner": planner(seeded),
     }
-    given.out.write_text(json.dumps(found), "utf-8")
+    options.out.write_text(json.dumps(measured), "utf-8")
 
 
 def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
@@ -77,7 +77,7 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
     client = Client()
     client.force_login(seeded.viewer)
     chance = random.Random(1)
-    found = {}
+    timings = {}
     for page, address in _addresses(seeded).items():
         _ask(client, address(seeded.plans[0]))  # loads templates and scipy
         caching.clear_caches()
@@ -85,19 +85,19 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
         warm: list[float] = []
         busy: list[float] = []
         queries = 0
-        asked = chance.sample(list(seeded.plans), min(rounds, len(seeded.plans)))
-        for plan in asked:
+        sampled = chance.sample(list(seeded.plans), min(rounds, len(seeded.plans)))
+        for plan in sampled:
             with CaptureQueriesContext(connection) as captured:
                 _ask(client, address(plan))
             queries = max(queries, len(captured))
         caching.clear_caches()
         for times in (cold, warm):
-            for plan in asked:
+            for plan in sampled:
                 began, worked = time.perf_counter(), time.process_time()
                 _ask(client, address(plan))
                 times.append((time.perf_counter() - began) * _MS)
                 busy.append((time.process_time() - worked) * _MS)
-        found[page] = {
+        timings[page] = {
             "p50": statistics.median(warm),
             "p95": _share(warm, 0.95),
             "cold_p50": statistics.median(cold),
@@ -106,15 +106,15 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
             "cold_cpu_p95": _share(busy[: len(cold)], 0.95),
             "queries": float(queries),
         }
-    return found
+    return timings
 
 
 def _addresses(seeded: Seeded) -> dict[str, Callable[[Any], str]]:
-    def under(plan: Any, rest: str = "") -> str:
-        return f"/result/plans/{plan.name}/{plan.version}/{rest}"
+    def under(plan: Any, path: str = "") -> str:
+        return f"/result/plans/{plan.name}/{plan.version}/{path}"
 
-    def api(plan: Any, rest: str) -> str:
-        return f"/api/v1/plans/{plan.name}/{plan.version}/{rest}"
+    def api(plan: Any, path: str) -> str:
+        return f"/api/v1/plans/{plan.name}/{plan.version}/{path}"
 
     return {
         "dashboard": lambda plan: "/result/lab/",
@@ -136,30 +136,30 @@ def planner(seeded: Seeded) -> dict[str, float]:
     """
     from django.test import Client
 
-    person, other = Client(), Client()
+    person, operator = Client(), Client()
     person.force_login(seeded.viewer)
-    other.force_login(seeded.operators[0])
+    operator.force_login(seeded.operators[0])
     address, answers = "/result/plans/", []
 
     def ask(number: int) -> None:
         answers.append(person.get("/api/v1/planner", {"rate": 0.2 + number / 100}).status_code)
 
-    _ask(other, address)
+    _ask(operator, address)
     asking = [threading.Thread(target=ask, args=(number,)) for number in range(_QUESTIONS)]
     for thread in asking:
         thread.start()
     times: list[float] = []
     while any(thread.is_alive() for thread in asking) or len(times) < _QUESTIONS:
         began = time.perf_counter()
-        _ask(other, address)
+        _ask(operator, address)
         times.append((time.perf_counter() - began) * _MS)
     for thread in asking:
         thread.join()
-    answered = sum(status == 200 for status in answers)
+    accepted = sum(status == 200 for status in answers)
     refused = sum(status == 503 for status in answers)
-    if answered + refused < _QUESTIONS:
+    if accepted + refused < _QUESTIONS:
         raise SystemExit(f"the planner answered {sorted(set(answers))}")
-    return {"page_p95_ms": _share(times, 0.95), "answered": float(answered), "refused": float(refused)}
+    return {"page_p95_ms": _share(times, 0.95), "answered": float(accepted), "refused": float(refused)}
 
 
 def exports(seeded: Seeded) -> dict[str, float]:
@@ -168,19 +168,19 @@ def exports(seeded: Seeded) -> dict[str, float]:
 
     client = Client()
     client.force_login(seeded.viewer)
-    found = {}
+    rates = {}
     for format in ("csv", "parquet"):
         began, rows = time.perf_counter(), 0
         for plan in seeded.plans[:40]:
             answer = client.get(f"/api/v1/plans/{plan.name}/{plan.version}/outcomes?format={format}")
             content = b"".join(answer.streaming_content)
             rows += content.count(b"\r\n") - 1 if format == "csv" else _parquet_rows(content)
-        found[f"evaluation_{format}"] = rows / (time.perf_counter() - began)
+        rates[f"evaluation_{format}"] = rows / (time.perf_counter() - began)
     began = time.perf_counter()
     answer = client.get("/api/v1/trials?format=csv")
     rows = sum(piece.count(b"\r\n") for piece in answer.streaming_content) - 1
-    found["all_trials_csv"] = rows / (time.perf_counter() - began)
-    return found
+    rates["all_trials_csv"] = rows / (time.perf_counter() - began)
+    return rates
 
 
 def _parquet_rows(content: bytes) -> int:
@@ -310,10 +310,10 @@ def _made(trial: Any, operator: Any) -> None:
 def _out_of_order(handed: Sequence[tuple[int, int, int]]) -> int:
     """Return the number of blocks that began out of order, changed their station, or had two stations."""
     begun = list(dict.fromkeys(block for _, block, _ in handed))
-    wrong = sum(one > other for one, other in pairwise(begun))
+    wrong = sum(first > second for first, second in pairwise(begun))
     for station in {station for *_, station in handed}:
         mine = [(index, block) for index, block, at in handed if at == station]
-        wrong += sum(one > other for one, other in pairwise(mine))
+        wrong += sum(first > second for first, second in pairwise(mine))
     owners: dict[int, set[int]] = {}
     for _, block, station in handed:
         owners.setdefault(block, set()).add(station)

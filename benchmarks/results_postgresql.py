@@ -47,8 +47,8 @@ def server(folder: Path) -> Iterator[str]:
 
 
 def _program(name: str) -> str | None:
-    found = next((place / name for place in _PLACES if (place / name).exists()), None)
-    return str(found) if found else shutil.which(name)
+    path = next((place / name for place in _PLACES if (place / name).exists()), None)
+    return str(path) if path else shutil.which(name)
 
 
 def _run(name: str, *words: str) -> None:
@@ -56,6 +56,8 @@ def _run(name: str, *words: str) -> None:
     if program is None:
         raise SystemExit(f"{name} is not installed")
     user = _USER if os.geteuid() == 0 else None
-    done = subprocess.run([program, *words], user=user, cwd="/", capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{name} failed: {done.stderr or done.stdout}")
+    completed = subprocess.run(
+        [program, *words], user=user, cwd="/", capture_output=True, text=True, check=False
+    )
+    if completed.returncode:
+        raise SystemExit(f"{name} failed: {completed.stderr or completed.stdout}")

@@ -68,10 +68,10 @@ def seed(plans: int, trials: int) -> Seeded:
     checkpoints = [Checkpoint.objects.create(name=f"policy-{i:02}") for i in range(12)]
     late = round(plans * 0.95)  # plans from here on are still running
     share = trials // plans
-    made = [
+    created = [
         _plan(i, share, chance, operators, stations, scenes, checkpoints, i >= late) for i in range(plans)
     ]
-    return Seeded(made, viewer, operators, stations, trials)
+    return Seeded(created, viewer, operators, stations, trials)
 
 
 def multiplied(seeded: Seeded, times: int) -> Seeded:
@@ -290,11 +290,11 @@ def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
     from evaweb.plans.commitment import draw_codes
     from evaweb.plans.models import Handout
 
-    known = draw_codes(bytes(plan.key), len(slots))
+    codes = draw_codes(bytes(plan.key), len(slots))
     _written(
         [
             Handout(plan=plan, number=n, slot=slot, trial=trial, code=code)
-            for n, (slot, trial, code) in enumerate(zip(slots, trials, known, strict=True), start=1)
+            for n, (slot, trial, code) in enumerate(zip(slots, trials, codes, strict=True), start=1)
         ]
     )
 

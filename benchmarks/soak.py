@@ -50,19 +50,19 @@ def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: i
     chosen = chosen or fuzzers()
     first = secrets.randbelow(2**31) if first is None else first
     begun, seed = time.monotonic(), first
-    found = dict.fromkeys(chosen, 0)
+    counts = dict.fromkeys(chosen, 0)
     rows: list[dict[str, object]] = [{"first_seed": first}]
     settled: list[HeldResources] = []  # after each round after settling
     while not settled or time.monotonic() - begun < seconds:
         for name, once in chosen.items():
             with _quiet():
                 violations = once(seed)
-            found[name] += bool(violations)
-            rows += [{"fuzzer": name, "seed": seed, "violation": said} for said in violations]
+            counts[name] += bool(violations)
+            rows += [{"fuzzer": name, "seed": seed, "violation": text} for text in violations]
         seed += 1
         if settled or time.monotonic() - begun >= _SETTLED * seconds:
             settled.append(held_resources())
-    figures = [Figure(f"violations.{name}", found[name], "", "== 0") for name in chosen]
+    figures = [Figure(f"violations.{name}", counts[name], "", "== 0") for name in chosen]
     figures += [Figure(f"scenarios.{name}", seed - first, "") for name in chosen]
     return Report("soak", [*figures, *_grown(settled)], rows)
 
@@ -95,13 +95,13 @@ def _grown(settled: Sequence[HeldResources]) -> list[Figure]:
     Memory has no requirement if there are too few rounds.
     """
     before, after = settled[0], settled[-1]
-    memory = [held.memory_mb for held in settled]
+    memory = [sample.memory_mb for sample in settled]
     slope = float(theilslopes(memory).slope) if len(memory) > 1 else 0.0
-    wanted = f"<= {_GROWTH_MB:g}" if len(memory) >= _ROUNDS else ""
+    allowed = f"<= {_GROWTH_MB:g}" if len(memory) >= _ROUNDS else ""
     return [
         Figure("leaks.files", after.files - before.files, "", "<= 0"),
         Figure("leaks.threads", after.threads - before.threads, "", "<= 0"),
         Figure("leaks.processes", after.children - before.children, "", "<= 0"),
-        Figure("growth.memory", slope, "MB", wanted),
+        Figure("growth.memory", slope, "MB", allowed),
         Figure("growth.rounds", len(memory), ""),
     ]

@@ -96,7 +96,11 @@ def started(
 
 def _station_dir(folder: Path, assignments: tuple[str, ...]) -> Path:
     """Return the folder of the deployment's station, or of the station that the assignments name."""
-    named = [one.partition("=")[2].strip('"') for one in assignments if one.startswith("station=")]
+    named = [
+        assignment.partition("=")[2].strip('"')
+        for assignment in assignments
+        if assignment.startswith("station=")
+    ]
     return folder / "stations" / (named[-1] if named else "bench-1")
 
 

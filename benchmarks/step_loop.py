@@ -137,13 +137,13 @@ class StepLoop:
         arrival = ArrivedChunk(request.number, request.step, request.rows, request.waited)
         first = self._merge.place(self.timeline, arrival, self.step).rows[:1]
         far = self._waiting and np.abs(first - self.commanded).max(initial=0.0) > FAR
-        held = self.commanded if (self._starved or far) and not self._merge.requests_while_stopped else None
+        start = self.commanded if (self._starved or far) and not self._merge.requests_while_stopped else None
         merged = join(
             self._merge,
             self.timeline,
             arrival,
             self.step,
-            held,
+            start,
             self._dims,
             joining=self._joining,
             commanded=self.commanded,

@@ -73,10 +73,10 @@ class Cell(Case):
     @property
     def config(self) -> StrategyParameters:
         """Parameters of the strategy: the defaults, at the cell's rate."""
-        made: StrategyParameters = variants("runtime.strategies")[self.strategy].Config(
+        parameters: StrategyParameters = variants("runtime.strategies")[self.strategy].Config(
             inference_rate=self.inference_hz
         )
-        return made
+        return parameters
 
     def loop(self, meant: IntendedRows, start: Float64, spike: int = 0) -> StepLoop:
         """Return a step loop of the cell; the answer to request number _SLOW takes `spike` ticks instead of the
@@ -131,25 +131,27 @@ def measure(seconds: float) -> Report:
 def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
     """Yield the figures of one strategy: the worst values over its feasible cells, and the reaction in one cell."""
     kind, feasible = rows[0]["strategy"], [row for row in rows if row["feasible"]]
-    there = next(row for row in rows if all(row[key] == value for key, value in THE_CELL.items()))
+    reference_row = next(row for row in rows if all(row[key] == value for key, value in THE_CELL.items()))
     window = StrategyParameters().blend_window
     assert window != "all"
-    bound = THE_CELL["delay"] + window + there["interval"]
+    bound = THE_CELL["delay"] + window + reference_row["interval"]
     yield Figure(f"offset_steps.{kind}", max(abs(row["offset_steps"]) for row in feasible), "steps", "== 0")
     for share in (50, 90, 99):
-        wanted = f"<= {bound}" if (kind, share) == ("async", 99) else ""
-        yield Figure(f"reaction{share}_steps.{kind}", there[f"reaction{share}_steps"], "steps", wanted)
+        allowed = f"<= {bound}" if (kind, share) == ("async", 99) else ""
+        yield Figure(
+            f"reaction{share}_steps.{kind}", reference_row[f"reaction{share}_steps"], "steps", allowed
+        )
     for name in ("rms_error", "jerk_ratio"):
         unit = "rad" if name == "rms_error" else ""
         yield Figure(f"{name}.{kind}", max(row[name] for row in feasible), unit)
-        yield Figure(f"{name}_disagreeing.{kind}", there[f"{name}_disagreeing"], unit)
+        yield Figure(f"{name}_disagreeing.{kind}", reference_row[f"{name}_disagreeing"], unit)
     yield Figure(f"starved_steps.{kind}", sum(row["starved_steps"] for row in feasible), "steps", "== 0")
-    yield Figure(f"spike_starved_steps.{kind}", there["spike_starved_steps"], "steps")
+    yield Figure(f"spike_starved_steps.{kind}", reference_row["spike_starved_steps"], "steps")
 
 
 def _row(cell: Cell) -> dict[str, Any]:
     """Return the row of a cell."""
-    exact, other = measure_tracking(cell, False), measure_tracking(cell, True)
+    exact, disagreeing = measure_tracking(cell, False), measure_tracking(cell, True)
     spike = measure_tracking(cell, False, spike=cell.horizon + 5)
     reaction = measure_reaction(cell) if cell.feasible else (None, None, None)
     return asdict(cell) | {
@@ -158,8 +160,8 @@ def _row(cell: Cell) -> dict[str, Any]:
         "offset_steps": exact.offset,
         "rms_error": exact.rms_error,
         "jerk_ratio": exact.jerk_ratio,
-        "rms_error_disagreeing": other.rms_error,
-        "jerk_ratio_disagreeing": other.jerk_ratio,
+        "rms_error_disagreeing": disagreeing.rms_error,
+        "jerk_ratio_disagreeing": disagreeing.jerk_ratio,
         "reaction50_steps": reaction[0],
         "reaction90_steps": reaction[1],
         "reaction99_steps": reaction[2],
@@ -176,8 +178,8 @@ def measure_tracking(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
     begin = 2 * cell.cycle
     ticks = begin + 4 * spike + int(_SECONDS * cell.control_hz)
     table = reference.at(np.arange(ticks + 5 * cell.cycle + spike, dtype=float))
-    meant = chunks_of(table, cell.horizon)
-    loop = cell.loop(with_disagreement(meant) if disagree else meant, table[0], spike)
+    chunk_of = chunks_of(table, cell.horizon)
+    loop = cell.loop(with_disagreement(chunk_of) if disagree else chunk_of, table[0], spike)
     log = loop.run(ticks)
     for _ in range(4 * cell.cycle):  # so that a gap at the end can end
         if not log.executed[-1].starved:
@@ -240,20 +242,20 @@ def measure_reaction(cell: Cell) -> tuple[int, int, int]:
     worst = np.zeros(3, np.int64)
     for change in range(_CHANGES):
         loop.run(settled)
-        asked = len(loop.log.observed)
-        while len(loop.log.observed) == asked:
+        requests = len(loop.log.observed)
+        while len(loop.log.observed) == requests:
             loop.tick()
         loop.run(change * period // _CHANGES)
         at, before, mind.value = loop.step, mind.value, 1.0 - mind.value
         published = _actions(loop.run(settled).executed[at:])[:, 0]
-        done = np.abs(published - before)
-        worst = np.maximum(worst, [_last_below(done, share) + 1 for share in (0.5, 0.9, 0.99)])
+        response = np.abs(published - before)
+        worst = np.maximum(worst, [_last_below(response, share) + 1 for share in (0.5, 0.9, 0.99)])
     return int(worst[0]), int(worst[1]), int(worst[2])
 
 
-def _last_below(done: Float64, share: float) -> int:
-    """Return the index of the last step at which `done` is below `share`, with a tolerance of 1e-9; -1 if there is
+def _last_below(response: Float64, share: float) -> int:
+    """Return the index of the last step at which `response` is below `share`, with a tolerance of 1e-9; -1 if there is
     none.
     """
-    below = np.flatnonzero(done < share - 1e-9)
+    below = np.flatnonzero(response < share - 1e-9)
     return int(below[-1]) if len(below) else -1

@@ -133,13 +133,13 @@ def compare(case: Case) -> tuple[int, int]:
     module = variants("runtime.strategies")[case.strategy]
     config = module.Config.model_validate(case.section)
     loop = StepLoop(module, config, answer, lambda number: case.delay, spec.rate, start, spec.dims)
-    meant = [tick for tick in loop.run(_TICKS).executed if tick.makers]
-    other = [
+    planned_ticks = [tick for tick in loop.run(_TICKS).executed if tick.makers]
+    station_ticks = [
         tick
-        for tick in meant
+        for tick in planned_ticks
         if not np.array_equal(planned[first + tick.step], tick.action.astype(np.float32))
     ]
-    return len(meant), len(other)
+    return len(planned_ticks), len(station_ticks)
 
 
 def _run(spec: StationSpec, policy: TablePolicy) -> tuple[int, Mapping[int, Float32]]:
@@ -168,15 +168,15 @@ def _answer(start: Float64, case: Case) -> Answering:
     """Return the policy that both use: disagreeing chunks around `start`, rounded to float32 as in messages."""
     steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
     reference = Reference(case.control_hz)
-    meant = with_disagreement(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
+    chunk_of = with_disagreement(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
 
     def rows(step: int) -> Float64:
-        made = np.tile(start, (case.horizon, 1))
-        made[:, :DIM] += _SCALE * meant(step)
-        return made
+        filled = np.tile(start, (case.horizon, 1))
+        filled[:, :DIM] += _SCALE * chunk_of(step)
+        return filled
 
-    known = make_policy(rows)
-    return lambda step, given: known(step, given).astype(np.float32).astype(np.float64)
+    respond = make_policy(rows)
+    return lambda step, given: respond(step, given).astype(np.float32).astype(np.float64)
 
 
 def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: float) -> dict[str, Any]:

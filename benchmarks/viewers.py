@@ -28,39 +28,39 @@ def main() -> int:
     parser.add_argument("--reading", type=int, default=0, help="viewers that draw what they get")
     parser.add_argument("--stalled", type=int, default=0, help="viewers that never read")
     parser.add_argument("--seconds", type=float, default=20.0)
-    given = parser.parse_args()
-    print(json.dumps(asyncio.run(_watch(given))))
+    options = parser.parse_args()
+    print(json.dumps(asyncio.run(_watch(options))))
     return 0
 
 
-async def _watch(given: argparse.Namespace) -> dict[str, list[float]]:
+async def _watch(options: argparse.Namespace) -> dict[str, list[float]]:
     ages: list[float] = []
-    watching = [_read(given, number, ages) for number in range(given.reading)]
-    stalled = [_stall(given, number) for number in range(given.stalled)]
+    watching = [_read(options, number, ages) for number in range(options.reading)]
+    stalled = [_stall(options, number) for number in range(options.stalled)]
     frames = await asyncio.gather(*watching, *stalled)
-    return {"ages_ms": ages, "frames": [float(count) for count in frames[: given.reading]]}
+    return {"ages_ms": ages, "frames": [float(count) for count in frames[: options.reading]]}
 
 
-def _page(given: argparse.Namespace, name: str, **options: object) -> connect:
-    address = urlsplit(given.url)
+def _page(arguments: argparse.Namespace, name: str, **options: object) -> connect:
+    address = urlsplit(arguments.url)
     return connect(
-        f"ws://{address.netloc}/ws/stations/{given.station}?page={name}",
-        origin=given.url,
-        additional_headers={"Cookie": given.cookies},
+        f"ws://{address.netloc}/ws/stations/{arguments.station}?page={name}",
+        origin=arguments.url,
+        additional_headers={"Cookie": arguments.cookies},
         max_size=2**24,
         **options,  # type: ignore[arg-type]
     )
 
 
-async def _ask(socket: ClientConnection, given: argparse.Namespace) -> None:
-    await socket.send(json.dumps({"type": "watch", "streams": given.streams.split(",")}))
+async def _ask(socket: ClientConnection, options: argparse.Namespace) -> None:
+    await socket.send(json.dumps({"type": "watch", "streams": options.streams.split(",")}))
 
 
-async def _read(given: argparse.Namespace, number: int, ages: list[float]) -> int:
+async def _read(options: argparse.Namespace, number: int, ages: list[float]) -> int:
     frames = 0
-    async with _page(given, f"reading{number}") as socket:
-        await _ask(socket, given)
-        end = time.monotonic() + given.seconds
+    async with _page(options, f"reading{number}") as socket:
+        await _ask(socket, options)
+        end = time.monotonic() + options.seconds
         while (left := end - time.monotonic()) > 0:
             try:
                 message = await asyncio.wait_for(socket.recv(), left)
@@ -76,12 +76,12 @@ async def _read(given: argparse.Namespace, number: int, ages: list[float]) -> in
     return frames
 
 
-async def _stall(given: argparse.Namespace, number: int) -> int:
+async def _stall(options: argparse.Namespace, number: int) -> int:
     """Request everything, then read nothing from the connection until the time is over."""
-    async with _page(given, f"stalled{number}", ping_interval=None, max_queue=1, close_timeout=1) as socket:
-        await _ask(socket, given)
+    async with _page(options, f"stalled{number}", ping_interval=None, max_queue=1, close_timeout=1) as socket:
+        await _ask(socket, options)
         socket.transport.pause_reading()
-        await asyncio.sleep(given.seconds)
+        await asyncio.sleep(options.seconds)
         socket.transport.resume_reading()
     return 0
 

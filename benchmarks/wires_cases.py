@@ -52,10 +52,10 @@ class CaseSetup:
         command = [sys.executable, "-m", "benchmarks.wires_sender", str(self.times), page, module, *arguments]
         self.sender = self.stack.enter_context(process(command, self.page))
         assert self.sender.stdout is not None
-        said = self.sender.stdout.readline()
-        if not said:
+        line = self.sender.stdout.readline()
+        if not line:
             raise SystemExit(f"the sender {module} ended with {self.sender.wait()}")
-        announced: Mapping[str, Any] = json.loads(said)
+        announced: Mapping[str, Any] = json.loads(line)
         return announced
 
     def sized(self) -> tuple[str, ...]:
@@ -159,8 +159,12 @@ def end(child: subprocess.Popen[str]) -> None:
 def _node(stage: CaseSetup, *more: str) -> dict[str, Any]:
     """Start a simulated node, and return its transport."""
     free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
-    said = stage.send("node", "--robot", stage.robot, *free, *more)
-    return {"kind": "zmq", "sub_endpoint": said["obs_endpoint"], "pub_endpoint": said["action_endpoint"]}
+    announced = stage.send("node", "--robot", stage.robot, *free, *more)
+    return {
+        "kind": "zmq",
+        "sub_endpoint": announced["obs_endpoint"],
+        "pub_endpoint": announced["action_endpoint"],
+    }
 
 
 def _zmq(stage: CaseSetup) -> CaseEndpoints:
@@ -241,6 +245,6 @@ def _mjpeg_cameras(stage: CaseSetup) -> CaseEndpoints:
     rate, stage.hurried = str(min(stage.rate, _MOST_DECODED_HZ)), False
     transport = _node(stage, "--rate", rate, "--height", "32", "--width", "32")
     height, width = stage.size
-    said = stage.send("cameras", str(len(keys)), rate, str(width), str(height))
-    cameras = {key: {"kind": "mjpeg", "url": url} for key, url in zip(keys, said["urls"], strict=True)}
+    announced = stage.send("cameras", str(len(keys)), rate, str(width), str(height))
+    cameras = {key: {"kind": "mjpeg", "url": url} for key, url in zip(keys, announced["urls"], strict=True)}
     return CaseEndpoints(transport, cameras, born="bar")

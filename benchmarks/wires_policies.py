@@ -92,22 +92,22 @@ def measure(seconds: float) -> list[Row]:
 
 
 def _case(protocol: Protocol, robot: Robot, seconds: float) -> Row:
-    why = absent(protocol, robot)
-    if why:
-        return {"protocol": protocol.name, "absent": why}
-    shown = observation(robot)
-    peer, missing = _peer(shown) if protocol.name == "openpi" else (None, "")
+    reason = absent(protocol, robot)
+    if reason:
+        return {"protocol": protocol.name, "absent": reason}
+    sample = observation(robot)
+    peer, missing = _peer(sample) if protocol.name == "openpi" else (None, "")
     with _server(protocol) as url:
-        opened: list[Opening] = [lambda: _ours(protocol, robot, url, shown)]
+        opened: list[Opening] = [lambda: _ours(protocol, robot, url, sample)]
         opened += [] if peer is None else [lambda: peer(url)]
         rounds = [_round(opened, len(opened) * seconds / _ROUNDS) for _ in range(_ROUNDS)]
-        weighed = _weighed(protocol, robot, url, shown)
-    ours = Timed.joined([found[0] for found in rounds])
-    row: Row = {"protocol": protocol.name, "requests": len(ours.round_trips), **ours.row(), **weighed}
+        weighed = _weighed(protocol, robot, url, sample)
+    own = Timed.joined([pair[0] for pair in rounds])
+    row: Row = {"protocol": protocol.name, "requests": len(own.round_trips), **own.row(), **weighed}
     if peer is not None:
-        theirs = Timed.joined([found[1] for found in rounds]).row()
-        row["peer"] = {"name": _PEER, "version": importlib.metadata.version(_PEER), **theirs}
-        row["ratio"] = float(np.median([mine.median / other.median for mine, other in rounds]))
+        reference = Timed.joined([pair[1] for pair in rounds]).row()
+        row["peer"] = {"name": _PEER, "version": importlib.metadata.version(_PEER), **reference}
+        row["ratio"] = float(np.median([mine.median / compared.median for mine, compared in rounds]))
     elif missing:
         row["peer_absent"] = missing
     return row
@@ -123,10 +123,10 @@ def _round(opened: Sequence[Opening], seconds: float) -> list[Timed]:
 
 
 @contextlib.contextmanager
-def _ours(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Iterator[Ask]:
+def _ours(protocol: Protocol, robot: Robot, url: str, sample: Observation) -> Iterator[Ask]:
     with contextlib.closing(_policy(protocol, robot, url)) as policy:
         policy.connect()
-        yield lambda: policy.infer(shown)
+        yield lambda: policy.infer(sample)
 
 
 @dataclass(slots=True)
@@ -139,8 +139,8 @@ class Timed:
     @classmethod
     def joined(cls, parts: Sequence[Timed]) -> Timed:
         return cls(
-            [one for part in parts for one in part.round_trips],
-            [one for part in parts for one in part.processor],
+            [duration for part in parts for duration in part.round_trips],
+            [duration for part in parts for duration in part.processor],
         )
 
     @property
@@ -160,17 +160,17 @@ def in_turn(
     for _ in range(WARM):
         for ask in asks:
             ask()
-    found = [Timed() for _ in asks]
+    timings = [Timed() for _ in asks]
     order = list(range(len(asks)))
     end = clock() + seconds
     while clock() < end:
         for index in order:
             used, begun = time.process_time(), clock()
             asks[index]()
-            found[index].round_trips.append(clock() - begun)
-            found[index].processor.append(time.process_time() - used)
+            timings[index].round_trips.append(clock() - begun)
+            timings[index].processor.append(time.process_time() - used)
         order.reverse()
-    return found
+    return timings
 
 
 def observation(robot: Robot) -> Observation:
@@ -198,7 +198,7 @@ def _policy(protocol: Protocol, robot: Robot, url: str | None = None) -> Policy:
     return policy
 
 
-def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
+def _peer(sample: Observation) -> tuple[Callable[[str], Opened] | None, str]:
     """Return the published client with the same requests, or the reason why it is not available."""
     try:
         from openpi_client.websocket_client_policy import WebsocketClientPolicy
@@ -210,8 +210,8 @@ def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
         client = WebsocketClientPolicy(url)
 
         def ask() -> object:
-            views = {key: picture.transpose(2, 0, 1) for key, picture in shown.pictures.items()}
-            return client.infer({"state": shown.qpos, "images": views, "prompt": shown.prompt})
+            views = {key: picture.transpose(2, 0, 1) for key, picture in sample.pictures.items()}
+            return client.infer({"state": sample.qpos, "images": views, "prompt": sample.prompt})
 
         yield ask
         client._ws.close()  # it has no public method
@@ -219,18 +219,18 @@ def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
     return opened, ""
 
 
-def _weighed(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Row:
+def _weighed(protocol: Protocol, robot: Robot, url: str, sample: Observation) -> Row:
     """Return the bytes per request and per answer, with all overhead of the protocol, counted by a relay."""
     place = urlsplit(url)
     assert place.port is not None
     with Relay(place.port) as relay:
-        there = place._replace(netloc=f"127.0.0.1:{relay.port}").geturl()
-        with contextlib.closing(_policy(protocol, robot, there)) as policy:
+        relayed = place._replace(netloc=f"127.0.0.1:{relay.port}").geturl()
+        with contextlib.closing(_policy(protocol, robot, relayed)) as policy:
             policy.connect()
-            policy.infer(shown)
+            policy.infer(sample)
             before = relay.settled()
             for _ in range(_WEIGHED):
-                policy.infer(shown)
+                policy.infer(sample)
             out, back = (now - then for now, then in zip(relay.settled(), before, strict=True))
     return {"request_bytes": out / _WEIGHED, "answer_bytes": back / _WEIGHED}
 
@@ -244,10 +244,10 @@ def _server(protocol: Protocol) -> Iterator[str]:
     assert child.stdin is not None
     assert child.stdout is not None
     try:
-        said = child.stdout.readline()
-        if not said:
+        line = child.stdout.readline()
+        if not line:
             raise SystemExit(f"the stand-in for {protocol.name} ended with {child.wait()}")
-        yield json.loads(said)["url"]
+        yield json.loads(line)["url"]
     finally:
         child.stdin.close()
         child.wait(_PATIENCE_S)

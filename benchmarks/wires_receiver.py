@@ -59,26 +59,26 @@ def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
     module = variants("runtime.transports")[given.transport["kind"]]
     kinds = variants("runtime.cameras")
     cameras = {key: kinds[table["kind"]].Config(**table) for key, table in given.cameras.items()}
-    told = replace(robot, cameras=tuple(camera for camera in robot.cameras if camera.key not in cameras))
-    return attach_cameras(module.source(module.Config(**given.transport), told, clock), cameras, clock)
+    reduced = replace(robot, cameras=tuple(camera for camera in robot.cameras if camera.key not in cameras))
+    return attach_cameras(module.source(module.Config(**given.transport), reduced, clock), cameras, clock)
 
 
 def main(text: str) -> None:
     """Receive observations until the lifeline ends."""
     heap.keep_freed_memory()
-    given = Receiving(**json.loads(text))
-    robot = robots.load_robot(given.robot)
-    clock = VirtualClock() if given.fast else MonotonicClock()
+    settings = Receiving(**json.loads(text))
+    robot = robots.load_robot(settings.robot)
+    clock = VirtualClock() if settings.fast else MonotonicClock()
     player = _Player()
-    shared = SharedState.attach(layout(robot), given.shared)
-    with contextlib.closing(source(given, robot, clock)) as opened:
+    shared = SharedState.attach(layout(robot), settings.shared)
+    with contextlib.closing(source(settings, robot, clock)) as opened:
         intake = ObservationReceiver(
             shared, opened, clock, _say, lambda observation, numbers: player.receive(observation)
         )
         opened.connect()
         opened.begin_run()
         while not select.select([sys.stdin], [], [], 0.0)[0]:
-            intake.poll(0.0 if given.fast else _PUMP_S)
+            intake.poll(0.0 if settings.fast else _PUMP_S)
             if isinstance(clock, VirtualClock):
                 clock.advance(1.0 / FPS)
             if player.over:

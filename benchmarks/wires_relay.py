@@ -66,16 +66,16 @@ class Relay:
             server = socket.create_connection(("127.0.0.1", self._target))
             with self._lock:
                 self._ends += [client, server]
-            for way, source, sink in ((0, client, server), (1, server, client)):
-                thread = threading.Thread(target=self._pass, args=(way, source, sink), daemon=True)
+            for direction, source, sink in ((0, client, server), (1, server, client)):
+                thread = threading.Thread(target=self._pass, args=(direction, source, sink), daemon=True)
                 self._threads.append(thread)
                 thread.start()
 
-    def _pass(self, way: int, source: socket.socket, sink: socket.socket) -> None:
+    def _pass(self, direction: int, source: socket.socket, sink: socket.socket) -> None:
         with contextlib.suppress(OSError):
             while piece := source.recv(_PIECE):
                 sink.sendall(piece)
                 with self._lock:
-                    self._counted[way] += len(piece)
+                    self._counted[direction] += len(piece)
         with contextlib.suppress(OSError):
             sink.shutdown(socket.SHUT_WR)

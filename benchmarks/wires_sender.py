@@ -43,9 +43,9 @@ class Pace:
         """Wait until the sender may send one more image."""
         end = self._clock.now() + self._patience
         while True:
-            seen = self._arrived()
-            self._ahead = max(0, self._ahead - (seen - self._seen))
-            self._seen = seen
+            arrived = self._arrived()
+            self._ahead = max(0, self._ahead - (arrived - self._seen))
+            self._seen = arrived
             if self._ahead < _AHEAD:
                 break
             now = self._clock.now()
@@ -90,9 +90,9 @@ def main(file: str, shared: str, module: str, *arguments: str) -> int:
     simulated = importlib.import_module(f"runtime.simulation.{module}")
     plain = simulated.run
 
-    def run(ticking: node.Ticking, clock: Clock, rate: float, told: Event) -> None:
+    def run(ticking: node.Ticking, clock: Clock, rate: float, stop: Event) -> None:
         noting = TimestampingNode(ticking, clock, _pace(shared, arguments, clock) if shared else None)
-        plain(noting, clock, rate, told)
+        plain(noting, clock, rate, stop)
         Path(file).write_text(json.dumps(noting.times), "utf-8")
 
     simulated.run = run  # type: ignore[attr-defined]
@@ -109,9 +109,9 @@ def _pace(shared: str, arguments: Sequence[str], clock: Clock) -> Pace:
 def _cameras(file: Path, arguments: Sequence[str]) -> int:
     count, rate, width, height = int(arguments[0]), float(arguments[1]), int(arguments[2]), int(arguments[3])
     servers = [TimestampingCameraServer(width, height, rate) for _ in range(count)]
-    told = program.stop_event(lifeline=True)
+    stop = program.stop_event(lifeline=True)
     program.announce_ready({"urls": [server.start() for server in servers]}, None)
-    told.wait()
+    stop.wait()
     for server in servers:
         server.close()
     file.write_text(json.dumps([server.times for server in servers]), "utf-8")

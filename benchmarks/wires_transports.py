@@ -49,8 +49,8 @@ def measure(seconds: float) -> list[Row]:
     """Return a row per transport: live for `seconds`, then with the images of ten minutes as fast as possible."""
     rows: list[Row] = []
     for case in cases():
-        why = absent(case)
-        rows.append({"transport": case.name, **({"absent": why} if why else _measured(case, seconds))})
+        reason = absent(case)
+        rows.append({"transport": case.name, **({"absent": reason} if reason else _measured(case, seconds))})
     return rows
 
 
@@ -67,14 +67,14 @@ def live(case: Case, seconds: float) -> Row:
         time.sleep(_SETTLE_S)
         watched = psutil.Process(receiver.pid)
         before, begun = _processor(watched), time.monotonic()
-        looks, arrivals = _control_readings(shared, seconds)
+        readings, arrivals = _control_readings(shared, seconds)
         took = time.monotonic() - begun
         used = (_processor(watched) - before) / took
         faults, sent = _ended(receiver), stage.sent()
-        known = [age for age in image_ages(looks, wired.born, sent) if age is not None]
+        ages = [age for age in image_ages(readings, wired.born, sent) if age is not None]
     return {
         "cpu_percent": 100.0 * used,
-        "age_ms": {f"p{q}": 1e3 * float(np.percentile(known, q)) for q in (50, 99)},
+        "age_ms": {f"p{q}": 1e3 * float(np.percentile(ages, q)) for q in (50, 99)},
         "observation_hz": arrivals / took,
         "sent_hz": sent_hz(sent, begun, took),
         "faults": faults,
@@ -114,8 +114,8 @@ def _staged(
 
 def _receiving(stage: CaseSetup, wired: CaseEndpoints, fast: bool) -> subprocess.Popen[str]:
     """Start the receiving process, which fills the shared state."""
-    given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
-    command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
+    options = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
+    command = [sys.executable, "-m", "benchmarks.wires_receiver", options.text()]
     return stage.stack.enter_context(process(command, stage.page))
 
 
@@ -127,18 +127,18 @@ def _await(
     Raises:
         SystemExit: If no more arrive.
     """
-    seen, since = 0, time.monotonic()
+    newest, since = 0, time.monotonic()
     latest = since + seconds
-    while seen < frames and time.monotonic() < latest:
+    while newest < frames and time.monotonic() < latest:
         time.sleep(0.02)
         now = int(shared.observation.read()["picture_number"].min())
-        if now > seen:
-            seen, since = now, time.monotonic()
+        if now > newest:
+            newest, since = now, time.monotonic()
         if receiver.poll() is not None or time.monotonic() - since > PATIENCE_S:
             raise SystemExit(
-                f"{seen} of {frames} pictures of each camera came, then none for {PATIENCE_S:g} s"
+                f"{newest} of {frames} pictures of each camera came, then none for {PATIENCE_S:g} s"
             )
-    return seen
+    return newest
 
 
 Look = list[
@@ -150,18 +150,18 @@ def _control_readings(shared: SharedState, seconds: float) -> tuple[list[Look], 
     """Return the readings of a control loop at each of its ticks, and the number of observations in that time."""
     clock = MonotonicClock()
     first = int(shared.observation.read()["sequence"])
-    looks: list[Look] = []
+    readings: list[Look] = []
     start = clock.now()
     for tick in range(int(seconds * _LOOKS_HZ)):
         clock.sleep_until(start + tick / _LOOKS_HZ)
         now, record = clock.now(), shared.observation.read()
-        look: Look = []
+        reading: Look = []
         for index, camera in enumerate(shared.layout.cameras):
             picture = shared.pictures[camera].read(int(record["picture_number"][index]))
             captured = float(record["picture_captured"][index])
-            look.append((None if picture is None else number_marks(picture), captured, now))
-        looks.append(look)
-    return looks, int(shared.observation.read()["sequence"]) - first
+            reading.append((None if picture is None else number_marks(picture), captured, now))
+        readings.append(reading)
+    return readings, int(shared.observation.read()["sequence"]) - first
 
 
 def number_marks(picture: UInt8) -> UInt8:
@@ -171,12 +171,12 @@ def number_marks(picture: UInt8) -> UInt8:
 
 def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
     """Return for each tick the age of the oldest image [s]; None if an image was being overwritten."""
-    found: list[float | None] = []
-    for look in looks:
-        births = [_birth(index, *one, born, sent) for index, one in enumerate(look)]
-        known = [birth for birth in births if birth is not None]
-        found.append(look[0][2] - min(known) if len(known) == len(look) else None)
-    return found
+    ages: list[float | None] = []
+    for reading in looks:
+        births = [_birth(index, *entry, born, sent) for index, entry in enumerate(reading)]
+        known_births = [birth for birth in births if birth is not None]
+        ages.append(reading[0][2] - min(known_births) if len(known_births) == len(reading) else None)
+    return ages
 
 
 def sent_hz(sent: Any, begun: float, took: float) -> float | None:
@@ -220,12 +220,12 @@ def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
 def _processor(process: psutil.Process) -> float:
     """Return the processor time of a process and its child processes so far [s]."""
     everybody = [process, *process.children(recursive=True)]
-    return float(sum(sum(one.cpu_times()[:2]) for one in everybody))
+    return float(sum(sum(member.cpu_times()[:2]) for member in everybody))
 
 
 def _resident(process: psutil.Process) -> float:
     """Return the memory of a process and its child processes [bytes]."""
-    return float(sum(one.memory_info().rss for one in [process, *process.children(recursive=True)]))
+    return float(sum(member.memory_info().rss for member in [process, *process.children(recursive=True)]))
 
 
 def _ended(receiver: subprocess.Popen[str]) -> Mapping[str, int]:

@@ -47,23 +47,23 @@ def main() -> int:
     parser.add_argument("data", type=Path, help="folder of that lab")
     parser.add_argument("--database", type=Path, help="folder of its PostgreSQL server, where it has one")
     parser.add_argument("--share", type=float, default=1.0, help="of the whole attack")
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.nice(_NICE)
-    target = _target(given)
-    print(json.dumps(ATTACKS[given.name](target)), flush=True)
+    target = _target(options)
+    print(json.dumps(ATTACKS[options.name](target)), flush=True)
     os._exit(0)  # without waiting for requests in progress
 
 
-def _target(given: argparse.Namespace) -> Target:
-    lab = json.loads(given.ready_file.read_text("utf-8"))
+def _target(options: argparse.Namespace) -> Target:
+    lab = json.loads(options.ready_file.read_text("utf-8"))
     return Target(
         url=lab["url"],
         stops=lab["stops"],
         passwords=lab["passwords"],
-        data=given.data,
-        database=given.database,
-        share=given.share,
-        begun=lambda: print(json.dumps({"begun": given.name}), flush=True),
+        data=options.data,
+        database=options.database,
+        share=options.share,
+        begun=lambda: print(json.dumps({"begun": options.name}), flush=True),
         ended=stop_event(lifeline=True),
     )
 

@@ -69,21 +69,23 @@ async def _crowd(target: Target, size: int, head: bytes, then: _Then) -> Counter
 
     Each sends `head`, and `then` uses it after the answer.
     """
-    done: Counter[str] = Counter()
-    answered = [asyncio.Event() for _ in range(target.part(size))]
-    tasks = [asyncio.create_task(_over_and_over(target, head, then, done, one)) for one in answered]
+    counts: Counter[str] = Counter()
+    first_answers = [asyncio.Event() for _ in range(target.part(size))]
+    tasks = [
+        asyncio.create_task(_over_and_over(target, head, then, counts, event)) for event in first_answers
+    ]
     with suppress(TimeoutError):
         async with asyncio.timeout(_BEGUN_S):
-            await asyncio.gather(*(one.wait() for one in answered))
+            await asyncio.gather(*(event.wait() for event in first_answers))
     target.begun()
     await asyncio.to_thread(target.ended.wait)
     for task in tasks:
         task.cancel()
-    return done
+    return counts
 
 
 async def _over_and_over(
-    target: Target, head: bytes, then: _Then, done: Counter[str], answered: asyncio.Event
+    target: Target, head: bytes, then: _Then, counts: Counter[str], first_answer: asyncio.Event
 ) -> None:
     while True:
         try:
@@ -92,13 +94,13 @@ async def _over_and_over(
                 try:
                     writer.write(head)
                     status = (await reader.readexactly(12))[9:].decode()
-                    answered.set()
+                    first_answer.set()
                     await then(reader, writer)
-                    done[status] += 1
+                    counts[status] += 1
                 finally:
                     writer.close()
         except (OSError, asyncio.IncompleteReadError) as fault:
-            done[type(fault).__name__] += 1
+            counts[type(fault).__name__] += 1
             await asyncio.sleep(_AGAIN_S)
 
 

@@ -83,8 +83,8 @@ def slow_frames(target: Target) -> Counter[str]:
 @contextmanager
 def _stopped(target: Target, *processes: str) -> Iterator[None]:
     """Pause processes of the other station (SIGSTOP) within the context."""
-    found = Endpoints(target.data / "stations" / OTHER).read("supervisor")
-    pids = [int(found[process]) for process in processes]
+    endpoints = Endpoints(target.data / "stations" / OTHER).read("supervisor")
+    pids = [int(endpoints[process]) for process in processes]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     try:
@@ -99,30 +99,30 @@ def _waves(target: Target, station: str, message: Mapping[str, Any], times: int)
 
     Return the number of pages, messages, answers and refused connections.
     """
-    done: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     visitor = target.visitor("viewer")
     while not target.ended.is_set():
         try:
             with closing(_Page(visitor, station)) as page:
-                done["pages"] += 1
+                counts["pages"] += 1
                 while not target.ended.is_set() and not page.closed:
                     page.send(message, times)
-                    done["sent"] += times
-                    if done["sent"] == times:
+                    counts["sent"] += times
+                    if counts["sent"] == times:
                         target.begun()
-                    _await(target, page, done["sent"])
-                done["answered"] += page.answered
+                    _await(target, page, counts["sent"])
+                counts["answered"] += page.answered
         except DemoFailed:
-            done["refused"] += 1
+            counts["refused"] += 1
             target.ended.wait(0.5)
-    return done
+    return counts
 
 
 def _await(target: Target, page: _Page, sent: int) -> None:
     """Wait until all `sent` messages are answered, or until no more answers arrive."""
-    answered, since = page.answered, time.monotonic()
+    answers, since = page.answered, time.monotonic()
     while page.answered < sent and not page.closed and not target.ended.wait(0.05):
-        if page.answered != answered:
-            answered, since = page.answered, time.monotonic()
+        if page.answered != answers:
+            answers, since = page.answered, time.monotonic()
         elif time.monotonic() - since > _QUIET_S:
             return

@@ -38,10 +38,12 @@ def half_open(target: Target) -> Counter[str]:
 async def _half_open(target: Target) -> Counter[str]:
     opened: Counter[str] = Counter()
     tried = [asyncio.Event() for _ in range(target.part(_CONNECTIONS))]
-    tries = [asyncio.create_task(_send_one(target, number, opened, one)) for number, one in enumerate(tried)]
+    tries = [
+        asyncio.create_task(_send_one(target, number, opened, event)) for number, event in enumerate(tried)
+    ]
     with suppress(TimeoutError):
         async with asyncio.timeout(_OPENING_S):
-            await asyncio.gather(*(one.wait() for one in tried))
+            await asyncio.gather(*(event.wait() for event in tried))
     target.begun()
     await asyncio.to_thread(target.ended.wait)
     for task in tries:
@@ -112,10 +114,10 @@ def _posted_file(visitor: RestClient, target: Target, path: str, text: str) -> i
         f'name="csrfmiddlewaretoken"\r\n\r\n{token}',
         f'name="file"; filename="lab.toml"\r\n\r\n{text}',
     )
-    said = "".join(f"--{border}\r\nContent-Disposition: form-data; {part}\r\n" for part in parts)
+    form_parts = "".join(f"--{border}\r\nContent-Disposition: form-data; {part}\r\n" for part in parts)
     headers = {"Content-Type": f"multipart/form-data; boundary={border}", "Cookie": visitor.cookies}
     with closing(http.client.HTTPConnection(*target.address, timeout=_ANSWER_S)) as connection:
-        connection.request("POST", path, f"{said}--{border}--\r\n".encode(), headers)
+        connection.request("POST", path, f"{form_parts}--{border}--\r\n".encode(), headers)
         return connection.getresponse().status
 
 
@@ -169,18 +171,18 @@ def long_to_parse(size: int, number: int) -> str:
 
 def again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], str]) -> Counter[str]:
     """Call `ask` repeatedly from `at_once` threads; return the number of answers by kind."""
-    done: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
 
     def requests() -> None:
         for number in count():
             try:
-                done[ask(target, number)] += 1
+                counts[ask(target, number)] += 1
             except (DemoFailed, OSError, http.client.HTTPException) as fault:
-                done[type(fault).__name__] += 1
+                counts[type(fault).__name__] += 1
                 target.ended.wait(0.05)
 
     for _ in range(at_once):
         threading.Thread(target=requests, daemon=True).start()
     target.begun()
     target.ended.wait()
-    return done
+    return counts

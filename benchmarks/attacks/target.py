@@ -27,8 +27,8 @@ class Target:
     @property
     def address(self) -> tuple[str, int]:
         """Host and port of the web."""
-        found = urlsplit(self.url)
-        return found.hostname or "", found.port or 80
+        address = urlsplit(self.url)
+        return address.hostname or "", address.port or 80
 
     def part(self, whole: int) -> int:
         """Return `whole` multiplied by `share`, at least 1."""
@@ -36,6 +36,6 @@ class Target:
 
     def visitor(self, username: str) -> RestClient:
         """Return a client that is logged in as that user."""
-        found = RestClient(self.url)
-        found.login(username, self.passwords[username])
-        return found
+        client = RestClient(self.url)
+        client.login(username, self.passwords[username])
+        return client

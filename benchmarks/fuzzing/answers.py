@@ -67,28 +67,28 @@ def once(seed: int) -> list[str]:
         module = variants("runtime.policies")[chosen.kind]
         config = module.Config(url=url, connect_deadline=10.0, inference_deadline=10.0, **chosen.settings)
         with closing(module.build(config, _ROBOT, MonotonicClock(), 30.0)) as policy:
-            found = _asked(policy, values)
-    wrong = [text for text in found if not text.startswith("error")]
-    failed = len(found) - len(wrong)
+            problems = _asked(policy, values)
+    wrong = [text for text in problems if not text.startswith("error")]
+    failed = len(problems) - len(wrong)
     if failed > doubled():
-        wrong.append(f"{failed} questions failed for {doubled()} doubled answers: {found}")
+        wrong.append(f"{failed} questions failed for {doubled()} doubled answers: {problems}")
     return [f"seed {seed}: {chosen.kind}: {text}" for text in wrong]
 
 
 def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
     """Return the violations found when `policy` is asked about each of `values` in turn."""
-    found: list[str] = []
+    problems: list[str] = []
     for value in values.tolist():
         near = np.clip(value, _ROBOT.lower, _ROBOT.upper)
         try:
             begins = policy.infer(_seen(_ROBOT, value)).actions[0]
         except PolicyError as error:
-            found.append(f"error: {error}")
+            problems.append(f"error: {error}")
             continue
         off = float(np.abs(begins - near).max())
         if off >= _NEAR:
-            found.append(f"the question about {value:.2f} has an answer that begins {off:.2f} away")
-    return found
+            problems.append(f"the question about {value:.2f} has an answer that begins {off:.2f} away")
+    return problems
 
 
 def _doubling(server: WebsocketServer, random: np.random.Generator) -> Callable[[], int]:

@@ -46,17 +46,17 @@ def body(name: str, groups: tuple[str, ...] | None = None) -> Body:
 def drawn(rng: np.random.Generator) -> Body:
     """Return a random bundled robot, sometimes with all groups, or with joints without limits."""
     name = str(rng.choice([*sorted(robots.robot_names()), "r1_lite"]))
-    made = body(name, _WHOLE if name == "r1_lite" and rng.random() < 0.5 else None)
-    return _endless(made, rng) if rng.random() < 0.3 else made
+    sampled = body(name, _WHOLE if name == "r1_lite" and rng.random() < 0.5 else None)
+    return _endless(sampled, rng) if rng.random() < 0.3 else sampled
 
 
-def _endless(made: Body, rng: np.random.Generator) -> Body:
+def _endless(bounded: Body, rng: np.random.Generator) -> Body:
     """Return the robot with two joints without limits whose ready pose is near half a turn, where readings wrap."""
-    turning = np.sort(rng.choice(np.flatnonzero(made.limits.position_mask), 2, replace=False))
-    lower, upper, ready = made.limits.lower.copy(), made.limits.upper.copy(), made.ready.copy()
+    turning = np.sort(rng.choice(np.flatnonzero(bounded.limits.position_mask), 2, replace=False))
+    lower, upper, ready = bounded.limits.lower.copy(), bounded.limits.upper.copy(), bounded.ready.copy()
     lower[turning], upper[turning] = -np.inf, np.inf
     ready[turning] = np.pi + rng.uniform(-0.2, 0.2, 2)
-    limits = replace(made.limits, lower=lower, upper=upper)
-    return made._replace(
-        limits=limits, dims=DimensionKinds(made.dims.switched, tuple(turning.tolist())), ready=ready
+    limits = replace(bounded.limits, lower=lower, upper=upper)
+    return bounded._replace(
+        limits=limits, dims=DimensionKinds(bounded.dims.switched, tuple(turning.tolist())), ready=ready
     )

@@ -23,8 +23,8 @@ def _walled(name: str) -> tuple[Workspace, Float64]:
     start = robot.poses["ready"].astype(np.float64)
     boxes = {}
     for arm in robot.arms:
-        here = arm.pose(start)[:3]
-        boxes[arm.name] = WorkspaceBox(lower=(here - _HALF).tolist(), upper=(here + _HALF).tolist())
+        position = arm.pose(start)[:3]
+        boxes[arm.name] = WorkspaceBox(lower=(position - _HALF).tolist(), upper=(position + _HALF).tolist())
     return Workspace(robot, boxes), start
 
 
@@ -40,9 +40,11 @@ def once(seed: int) -> list[str]:
     bench.say("follow", run=1)
     for tick in range(_TICKS):
         if tick % 8 == 0:
-            here = np.array(bench.status["commanded"], np.float64) if tick else start
-            there = np.where(limits.position_mask, here + rng.uniform(-1.0, 1.0, len(here)), here)
-            bench.chunk(tick + 1, np.linspace(here, there, int(rng.integers(8, 25))))
+            commanded = np.array(bench.status["commanded"], np.float64) if tick else start
+            goal = np.where(
+                limits.position_mask, commanded + rng.uniform(-1.0, 1.0, len(commanded)), commanded
+            )
+            bench.chunk(tick + 1, np.linspace(commanded, goal, int(rng.integers(8, 25))))
         if bench.behaviour == "hold":
             bench.say("follow", run=1)
         if rng.random() < 0.03:

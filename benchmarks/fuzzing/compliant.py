@@ -36,13 +36,13 @@ def once(seed: int) -> list[str]:
 
 def _move(bench: Compliant, rng: np.random.Generator, run: int) -> None:
     """Move elsewhere, by a motion or by chunks, sometimes stopped on the way; then hold for two seconds."""
-    here = np.array(bench.status["commanded"], np.float64)
+    commanded = np.array(bench.status["commanded"], np.float64)
     if rng.random() < 0.5:
         bench.say("motion", goal=rng.uniform(-0.8, 0.8, 2), speed=1.0)
     else:
-        way = 0.5 if here[0] < 0.0 else -0.5
+        amplitude = 0.5 if commanded[0] < 0.0 else -0.5
         bench.say("follow", run=run)
-        bench.chunk(run, here + wave(60, way), run=run)
+        bench.chunk(run, commanded + wave(60, amplitude), run=run)
     bench.seconds(float(rng.uniform(0.2, 1.5)))
     if rng.random() < 0.5:
         bench.stop().seconds(2.0)

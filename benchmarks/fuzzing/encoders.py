@@ -128,10 +128,10 @@ class Scenario(Bench):
     def _chunk(self) -> None:
         self.chunks += 1
         start = np.array(self.status["commanded"], np.float64)
-        way = np.linspace(start, start + self._apart(self._anything(0.3), start), 30)
+        rows = np.linspace(start, start + self._apart(self._anything(0.3), start), 30)
         jumps = np.flatnonzero(self.limits.grippers)
-        way[:, jumps] = self._anything(0.0)[jumps]
-        self.chunk(self.chunks, way, run=self.run_number)
+        rows[:, jumps] = self._anything(0.0)[jumps]
+        self.chunk(self.chunks, rows, run=self.run_number)
 
     # --- one tick ------------------------------------------------------------------------------------------------
 
@@ -182,8 +182,8 @@ class Scenario(Bench):
 
     # --- violations ----------------------------------------------------------------------------------------------
 
-    def _apart(self, there: Float64, here: Float64) -> Float64:
-        return difference(there, here, self.dims.wrapping)
+    def _apart(self, target: Float64, origin: Float64) -> Float64:
+        return difference(target, origin, self.dims.wrapping)
 
     @property
     def _known(self) -> Float64:
@@ -198,45 +198,48 @@ class Scenario(Bench):
         if not sent:
             self.previous, self.velocity = None, np.zeros((2, self.dim))
             return
-        told, stopped = sent[0].astype(np.float64), record.source == "estop"
-        if not np.isfinite(told).all() or (self.limits.excess(told) > 1e-5 * self.limits.radian_scale).any():
-            self._wrong(f"beyond the limits or no number: {told.tolist()}")
-        if stopped and told[self.speeds].any():
-            self._wrong(f"drives under the e-stop: {told[self.speeds].tolist()}")
+        action, stopped = sent[0].astype(np.float64), record.source == "estop"
+        if (
+            not np.isfinite(action).all()
+            or (self.limits.excess(action) > 1e-5 * self.limits.radian_scale).any()
+        ):
+            self._wrong(f"beyond the limits or no number: {action.tolist()}")
+        if stopped and action[self.speeds].any():
+            self._wrong(f"drives under the e-stop: {action[self.speeds].tolist()}")
         if self.previous is not None:
-            self._compare(told, self.previous, " ".join(record.notes), stopped)
-        elif (np.abs(self._apart(told, self._known)) > _NEAR)[self.places].any():
+            self._compare(action, self.previous, " ".join(record.notes), stopped)
+        elif (np.abs(self._apart(action, self._known)) > _NEAR)[self.places].any():
             self._wrong("taken over where it is not")
-        self._check_grippers(told, stopped)
-        self.previous = told
+        self._check_grippers(action, stopped)
+        self.previous = action
 
-    def _check_grippers(self, told: Float64, stopped: bool) -> None:
+    def _check_grippers(self, action: Float64, stopped: bool) -> None:
         """Check that grippers are commanded open or closed, and do not switch too often.
 
         In between is allowed if the command does not change, or if the first command is that of an e-stop (`stopped`).
-        `told` [D] is the command of this tick.
+        `action` [D] is the command of this tick.
         """
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]
-            switches = not np.isclose(told[dim], told[dim] if before is None else before)
-            if not np.isclose(told[dim], ends).any() and (switches or not (stopped or before is not None)):
-                self._wrong(f"a gripper neither open nor closed: {told[dim]}")
+            switches = not np.isclose(action[dim], action[dim] if before is None else before)
+            if not np.isclose(action[dim], ends).any() and (switches or not (stopped or before is not None)):
+                self._wrong(f"a gripper neither open nor closed: {action[dim]}")
             if switches and before is not None and np.isclose(before, ends).any():
                 if self.step - self.switched[dim] < _RESTS:
                     self._wrong("a gripper switches too often")
                 self.switched[dim] = self.step
 
-    def _compare(self, told: Float64, before: Float64, notes: str, stopped: bool) -> None:
-        moved = (told - before) / PERIOD
+    def _compare(self, action: Float64, before: Float64, notes: str, stopped: bool) -> None:
+        moved = (action - before) / PERIOD
         if "where the robot is" in notes:
             hardest = 60.0 * self.limits.radian_scale * _MARGIN * PERIOD
             onwards = np.clip(moved, -hardest, hardest)  # it counts as at rest, or has continued from there
             self.velocity = np.array([np.minimum(onwards, 0.0), np.maximum(onwards, 0.0)])
-            apart = np.abs(told - before) > 1e-6
+            apart = np.abs(action - before) > 1e-6
             near = np.maximum(np.abs(self._apart(before, self._known)), _NEAR)
-            if (apart & (np.abs(self._apart(told, self._known)) > near))[self.places].any():
+            if (apart & (np.abs(self._apart(action, self._known)) > near))[self.places].any():
                 self._wrong(f"stepped away from the robot: {notes}")
-            if (np.abs(told - before) > np.pi)[list(self.dims.wrapping)].any():
+            if (np.abs(action - before) > np.pi)[list(self.dims.wrapping)].any():
                 self._wrong(f"stepped by a turn: {notes}")
             return
         free = ~self.limits.binary
@@ -249,14 +252,14 @@ class Scenario(Bench):
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
             free = free & self.places
         gain = 60.0 * self.limits.radian_scale * _MARGIN * PERIOD + 1e-2 * self.limits.radian_scale
-        edge = (told <= self.limits.lower + 1e-6) | (told >= self.limits.upper - 1e-6)
+        edge = (action <= self.limits.lower + 1e-6) | (action >= self.limits.upper - 1e-6)
         if ((moved > most + gain) | (moved < least - gain))[free & ~edge].any():
             self._wrong(f"harder than it accelerates: {notes}")
         self.velocity = np.array([moved, moved])
 
-    def _wrong(self, what: str) -> None:
+    def _wrong(self, problem: str) -> None:
         doing = f"{self.name}, tick {self.step}, {self.behaviour}, encoders {self.fault or 'sound'}"
-        self.violations.append(f"{doing}: {what}")
+        self.violations.append(f"{doing}: {problem}")
 
 
 class EncoderOffsetScenario(Bench):
@@ -288,22 +291,22 @@ class EncoderOffsetScenario(Bench):
         if self._stopped:
             self.shared.set_estop(EStop.LATCHED)
             self.run(20)
-        begins, found = self.sent[-1], set[str]()
-        told = len(self.sent)
+        begins, problems = self.sent[-1], set[str]()
+        first_sent = len(self.sent)
         for tick in range(_TICKS):
             self.moved_by_hand = self.measured = self._read(tick * PERIOD)
             self.run()
-            found.update(self._wrong(self.measured))
+            problems.update(self._wrong(self.measured))
             self.body += self._lag * (self.sent[-1] - self.body)
         places = self.limits.position_mask
-        way = np.abs(np.diff(self.sent[told - 1 :], axis=0))[:, places]
-        far = np.ptp(self.sent[told - 1 :], axis=0)[places].max()
-        if (way > self.limits.velocity[places] * PERIOD * _MARGIN + 1e-4).any():
-            found.add("stepped faster than it moves")
+        steps = np.abs(np.diff(self.sent[first_sent - 1 :], axis=0))[:, places]
+        far = np.ptp(self.sent[first_sent - 1 :], axis=0)[places].max()
+        if (steps > self.limits.velocity[places] * PERIOD * _MARGIN + 1e-4).any():
+            problems.add("stepped faster than it moves")
         if far > self._bound(begins):
-            found.add(f"ran away by {far:.2f} rad")
+            problems.add(f"ran away by {far:.2f} rad")
         joint = self.limits.names[self._joint]
-        return [f"{self.name}, encoder of {joint}: {self._fault}: {what}" for what in sorted(found)]
+        return [f"{self.name}, encoder of {joint}: {self._fault}: {problem}" for problem in sorted(problems)]
 
     def _read(self, since: float) -> Float64:
         """Return the readings of the encoders [D] at `since` [s] after the fault began."""
@@ -320,15 +323,18 @@ class EncoderOffsetScenario(Bench):
 
     def _wrong(self, read: Float64) -> set[str]:
         """Return the violations in the tick in which the encoders' readings were `read` [D]."""
-        found, told, places = set[str](), self.sent[-1], self.limits.position_mask
-        if not np.isfinite(told).all() or (self.limits.excess(told) > 1e-5 * self.limits.radian_scale).any():
-            found.add("told beyond the limits, or no number")
+        problems, action, places = set[str](), self.sent[-1], self.limits.position_mask
+        if (
+            not np.isfinite(action).all()
+            or (self.limits.excess(action) > 1e-5 * self.limits.radian_scale).any()
+        ):
+            problems.add("told beyond the limits, or no number")
         if self._stopped and self.behaviour != "estop":
-            found.add(f"does not stand under the e-stop: {self.behaviour}")
-        near = np.abs(difference(read, told, self.dims.wrapping)) <= self.safety.following_error + 1e-4
+            problems.add(f"does not stand under the e-stop: {self.behaviour}")
+        near = np.abs(difference(read, action, self.dims.wrapping)) <= self.safety.following_error + 1e-4
         if not self.shared.joint_problem and not near[places].all():
-            found.add("a run may begin although the joint is not where it is held")
-        return found
+            problems.add("a run may begin although the joint is not where it is held")
+        return problems
 
     def _bound(self, begins: Float64) -> float:
         """Return the largest displacement [rad] that may be trusted: the following error plus the encoder's offset."""
@@ -341,5 +347,5 @@ def once(seed: int) -> list[str]:
     scenario = Scenario(seed)
     for _ in range(_TICKS):
         scenario.run_tick()
-    found = [*scenario.violations, *EncoderOffsetScenario(seed).violations()]
-    return [f"seed {seed}: {violation}" for violation in found]
+    violations = [*scenario.violations, *EncoderOffsetScenario(seed).violations()]
+    return [f"seed {seed}: {violation}" for violation in violations]

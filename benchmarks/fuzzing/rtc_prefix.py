@@ -99,12 +99,12 @@ def scenario(seed: int) -> Scenario:
 
 def once(seed: int) -> list[str]:
     """Run the scenario of `seed` on the virtual clock; return each violation as a sentence."""
-    made, random = scenario(seed), np.random.default_rng([seed, 1])
+    case, random = scenario(seed), np.random.default_rng([seed, 1])
     with tempfile.TemporaryDirectory() as folder:
-        spec = _plan(Path(folder), made)
-        keeper = PrefixKeepingPolicy(made, spec, random)
-        planned = _run(spec, made, keeper, random)
-    return [f"seed {seed}: {text}" for text in _violations(made, keeper, planned)]
+        spec = _plan(Path(folder), case)
+        keeper = PrefixKeepingPolicy(case, spec, random)
+        planned = _run(spec, case, keeper, random)
+    return [f"seed {seed}: {text}" for text in _violations(case, keeper, planned)]
 
 
 class RandomDelayRunner(LockstepRunner):
@@ -203,8 +203,8 @@ class PrefixKeepingPolicy(Policy):
         if missing:
             return f"is for step {missing[0]}, for which nothing was planned"
         rows = np.array([self._of(planned[step]) for step in steps])
-        meant = rows[0] + (part * self._difference(rows[-1], rows[0]) if len(rows) > 1 else 0.0)
-        off = np.abs(self._difference(row, meant))
+        expected = rows[0] + (part * self._difference(rows[-1], rows[0]) if len(rows) > 1 else 0.0)
+        off = np.abs(self._difference(row, expected))
         allowed = np.full(len(off), _POSES + missed if self._made.space == "eef" else _ROUNDING)
         if len(rows) > 1:
             allowed += 2.0 * self._bend(before, planned)
@@ -225,13 +225,13 @@ class PrefixKeepingPolicy(Policy):
         """Return planned joints in the space of the rows: as they are, or as poses."""
         return self._eef.eef_of(joints).astype(np.float64) if self._made.space == "eef" else joints
 
-    def _difference(self, one: Float64, other: Float64) -> Float64:
+    def _difference(self, left: Float64, right: Float64) -> Float64:
         if self._made.space == "eef":  # quaternions with the nearer sign
-            one, other = one.reshape(*one.shape[:-1], -1, EEF_WIDTH).copy(), other.reshape(-1, EEF_WIDTH)
-            turns = one[..., 3:7]
-            turns *= np.where((turns * other[..., 3:7]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
-            return (one - other).reshape(-1)
-        return difference(one, other, (0,) if self._made.endless else ())
+            left, right = left.reshape(*left.shape[:-1], -1, EEF_WIDTH).copy(), right.reshape(-1, EEF_WIDTH)
+            turns = left[..., 3:7]
+            turns *= np.where((turns * right[..., 3:7]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+            return (left - right).reshape(-1)
+        return difference(left, right, (0,) if self._made.endless else ())
 
     def _wandering(self, observation: Observation) -> Float64:
         """Return a random smooth path around the posture, with quaternion signs as servers answer."""
@@ -268,12 +268,12 @@ class PrefixKeepingPolicy(Policy):
         return rows * self._scale + self._shift if self._made.own else rows
 
 
-def _plan(data: Path, made: Scenario) -> StationSpec:
-    tree = lockstep_deployment(data, made.robot, made.strategy, made.control_hz)
+def _plan(data: Path, case: Scenario) -> StationSpec:
+    tree = lockstep_deployment(data, case.robot, case.strategy, case.control_hz)
     tree["faults"] = {"policy_lost": "slow", "patience_s": 1000.0}
     planned = check_deployment(loader.resolve_deployment(tree, {}, "prefix"))
     robot = planned.robot
-    if made.endless:
+    if case.endless:
         lower, upper = robot.lower.copy(), robot.upper.copy()
         lower[0], upper[0] = -np.inf, np.inf
         robot = replace(robot, lower=lower, upper=upper)
@@ -296,7 +296,7 @@ class Planned:
 
         Without such an answer, return the end of the run: lost answers fix nothing.
         """
-        return min((at for asked, at in self.arrived.items() if asked >= step), default=self.end)
+        return min((at for observed, at in self.arrived.items() if observed >= step), default=self.end)
 
     def missed_before(self, step: int, horizon: int) -> float:
         """Return the largest error of inverse kinematics in answers that may contribute to this step or the
@@ -306,11 +306,11 @@ class Planned:
 
 
 def _run(
-    spec: StationSpec, made: Scenario, keeper: PrefixKeepingPolicy, random: np.random.Generator
+    spec: StationSpec, case: Scenario, keeper: PrefixKeepingPolicy, random: np.random.Generator
 ) -> Planned:
     planned = Planned({}, set(), {}, set(), {}, 0)
-    around, clock = LockstepEnvironment(runner=RandomDelayRunner(*made.delay, random)), VirtualClock()
-    robot = SlowlyObservedRobot(spec.robot, clock, keeper.stands.copy(), made.seen_every)
+    around, clock = LockstepEnvironment(runner=RandomDelayRunner(*case.delay, random)), VirtualClock()
+    robot = SlowlyObservedRobot(spec.robot, clock, keeper.stands.copy(), case.seen_every)
     with closing(station_of(spec, robot, keeper, clock, around)) as station:
         session = station.coordinator.session
         station.connect()
@@ -329,22 +329,25 @@ def _run(
                 planned.held |= {step, step + 1}  # in the first of them, an unreported answer may be merged
             if not station.coordinator.inference.continues:
                 planned.other.add(step + 1)
-            shown = station.coordinator.inference.shown
-            if shown is not None and shown.state == "merged":
-                used = shown.targets[shown.targets >= 0]
-                worst = shown.ik.get("worst_mm", 0.0) / 1e3, math.radians(shown.ik.get("worst_deg", 0.0))
-                planned.missed[shown.observation_step] = max(worst)
-                planned.arrived.setdefault(shown.observation_step, int(used[0]))
+            displayed = station.coordinator.inference.shown
+            if displayed is not None and displayed.state == "merged":
+                used = displayed.targets[displayed.targets >= 0]
+                worst = (
+                    displayed.ik.get("worst_mm", 0.0) / 1e3,
+                    math.radians(displayed.ik.get("worst_deg", 0.0)),
+                )
+                planned.missed[displayed.observation_step] = max(worst)
+                planned.arrived.setdefault(displayed.observation_step, int(used[0]))
             return station.step >= end or random.random() < 0.02
 
         while station.step < end:
             station.until(over, 60.0, "the run")
-            _interfere(station, made, random)
+            _interfere(station, case, random)
         planned.end = station.step - 1
     return planned
 
 
-def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
+def _interfere(station: Lockstep, case: Scenario, random: np.random.Generator) -> None:
     """Do something at random that an operator might do now."""
     state = station.coordinator.session.state
     if state is SessionState.READY:
@@ -355,16 +358,16 @@ def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -
         station.command("halt" if random.random() < 0.7 else "stop")
     elif state is SessionState.RUNNING:
         kind = str(random.choice(_KINDS))
-        station.command("tune", strategy=made.strategy if kind == "rtc" else {"kind": kind})
+        station.command("tune", strategy=case.strategy if kind == "rtc" else {"kind": kind})
 
 
-def _violations(made: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -> list[str]:
+def _violations(case: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -> list[str]:
     """Return each fixed row that differs from the plan for its step by more than the arithmetic tolerance, as a
     sentence.
     """
-    found: list[str] = []
-    pace = (made.action_hz or made.control_hz) / made.control_hz
-    binding = made.keeps and made.action_hz is None and "k_max" not in made.strategy
+    problems: list[str] = []
+    pace = (case.action_hz or case.control_hz) / case.control_hz
+    binding = case.keeps and case.action_hz is None and "k_max" not in case.strategy
     for declared in keeper.declared:
         arrived = planned.arrived_for(declared.step)
         foreign = min((step for step in planned.other if step >= declared.step), default=planned.end)
@@ -374,7 +377,7 @@ def _violations(made: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -
             steps = range(declared.step, math.ceil(at - _HAIR) + 1)
             if steps[-1] >= over or any(step in planned.held for step in steps):
                 break  # the run was held, or an answer was merged that need not continue the prefix
-            off = keeper.apart(row, at, planned.rows, planned.missed_before(declared.step, made.horizon))
+            off = keeper.apart(row, at, planned.rows, planned.missed_before(declared.step, case.horizon))
             if off:
-                found.append(f"row {place} of the request about step {declared.step} ({made}) {off}")
-    return found
+                problems.append(f"row {place} of the request about step {declared.step} ({case}) {off}")
+    return problems
