@@ -33,30 +33,30 @@ if TYPE_CHECKING:
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run as the command line demands; return 0 on success, 1 if the run failed, 2 if the deployment is invalid."""
-    given = _parser().parse_args(arguments)
+    options = _parser().parse_args(arguments)
     log.configure_logging("supervisor")
     try:
-        made = check_deployment(_resolved(given))
+        spec = check_deployment(_resolved(options))
         # What does not fit it is said here, not by a coordinator that dies.
-        make_policy(made, MonotonicClock()).close()
-        _require_encoder(made)
-        if given.headless:
+        make_policy(spec, MonotonicClock()).close()
+        _require_encoder(spec)
+        if options.headless:
             from runtime.clients import headless
 
-            headless.check(made.deployment)
-        if given.lockstep:
+            headless.check(spec.deployment)
+        if options.lockstep:
             from runtime.processes.lockstep import lockstep
 
-            lockstep.check(made)
+            lockstep.check(spec)
     except RuntimeFault as fault:
         print(fault, file=sys.stderr)
         return 2
     try:
-        if given.check:
-            return _check(made)
-        if given.lockstep:
-            return run_in_lockstep(made)
-        return Supervisor(made, Lifeline() if given.lifeline else None).run(given.headless)
+        if options.check:
+            return _check(spec)
+        if options.lockstep:
+            return run_in_lockstep(spec)
+        return Supervisor(spec, Lifeline() if options.lifeline else None).run(options.headless)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         return 1
@@ -89,36 +89,36 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _resolved(given: argparse.Namespace) -> Resolved:
+def _resolved(options: argparse.Namespace) -> Resolved:
     """Return the deployment of the file, or of the earlier run, whose differences from that run are printed.
 
     Raises: ConfigurationError.
     """
-    if (given.deployment is None) == (given.from_run is None):
+    if (options.deployment is None) == (options.from_run is None):
         raise ConfigurationError("give one of the two: a deployment file, or --from-run UUID")
-    if given.from_run is None and given.data_dir is not None:
+    if options.from_run is None and options.data_dir is not None:
         raise ConfigurationError("--data-dir belongs to --from-run; for a file it is --set data_dir=DIR")
-    if given.from_run is None:
-        return loader.load(given.deployment, given.assignments)
-    found = rerun(given.from_run, data_folder(given.data_dir), given.assignments)
-    print(*found.lines, sep="\n", flush=True)
-    return found.resolved
+    if options.from_run is None:
+        return loader.load(options.deployment, options.assignments)
+    repeated = rerun(options.from_run, data_folder(options.data_dir), options.assignments)
+    print(*repeated.lines, sep="\n", flush=True)
+    return repeated.resolved
 
 
-def _require_encoder(made: StationSpec) -> None:
+def _require_encoder(spec: StationSpec) -> None:
     """Raise ConfigurationError if the encoder of the recording is missing, before the first run would need it."""
     from runtime.recording import encoder_check
 
-    if made.deployment.recording.enabled:
-        encoder_check.require_encoder(made.deployment.recording)
+    if spec.deployment.recording.enabled:
+        encoder_check.require_encoder(spec.deployment.recording)
 
 
-def _check(made: StationSpec) -> int:
-    print(json.dumps(dict(made.resolved.tree), indent=1))
-    print(f"hash {made.resolved.digest}")
-    robot = made.robot
+def _check(spec: StationSpec) -> int:
+    print(json.dumps(dict(spec.resolved.tree), indent=1))
+    print(f"hash {spec.resolved.digest}")
+    robot = spec.robot
     counts = f"{robot.dim} joints, {len(robot.cameras)} cameras"
-    print(f"ok: {robot.name}, {counts}, {made.rate:g} Hz, {made.fps:g} fps")
+    print(f"ok: {robot.name}, {counts}, {spec.rate:g} Hz, {spec.fps:g} fps")
     return 0
 
 
@@ -130,9 +130,9 @@ def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
     from runtime.ipc.session_state import SessionState
     from runtime.processes.lockstep import lockstep
 
-    done = lockstep.run(made, peers=peers)
-    episode = done.episode
-    print(f"{done.state}: {done.reason}")
+    result = lockstep.run(made, peers=peers)
+    episode = result.episode
+    print(f"{result.state}: {result.reason}")
     print(
         f"episode  {episode.get('path', 'none')}  {episode.get('rows', 0)} rows, {episode.get('status', '')}"
     )
@@ -141,7 +141,7 @@ def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
 
         print(f"export   {write_export(Path(episode['path']), made.deployment.data)}")
     # A run that held was ended by nobody's judgement: it is kept, but neither published nor a success.
-    well = done.state is SessionState.READY and episode.get("status", "finished") == "finished"
+    well = result.state is SessionState.READY and episode.get("status", "finished") == "finished"
     into = made.deployment.publish
     if well and into.dataset and episode and made.deployment.run.mode != "sim":
         from runtime.datasets.publishing import publish

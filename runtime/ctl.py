@@ -30,10 +30,10 @@ def main(words: Sequence[str] | None = None) -> int:
     Return 0 on success, 1 if the command was refused or failed, 3 if there was no answer, 141 if the output is no
     longer read.
     """
-    given = parse(sys.argv[1:] if words is None else words)
-    client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
+    options = parse(sys.argv[1:] if words is None else words)
+    client = StationClient(Path(options.data_dir).expanduser().absolute() / "stations" / options.station)
     try:
-        return _run_command(client, given)
+        return _run_command(client, options)
     except Refused as refusal:
         print(f"refused: {refusal}", file=sys.stderr)
     except TransportError as fault:
@@ -48,37 +48,37 @@ def main(words: Sequence[str] | None = None) -> int:
     return FAILED
 
 
-def _run_command(client: StationClient, given: argparse.Namespace) -> int:
-    if given.command in _OWN_WAYS:
-        return _OWN_WAYS[given.command](client, given)
-    if given.command in LASTING:
-        return _follow(client, given)
-    return _run_and_wait(client, given, given.command, arguments(given))
+def _run_command(client: StationClient, options: argparse.Namespace) -> int:
+    if options.command in _OWN_WAYS:
+        return _OWN_WAYS[options.command](client, options)
+    if options.command in LASTING:
+        return _follow(client, options)
+    return _run_and_wait(client, options, options.command, arguments(options))
 
 
 # --- commands that go on, and commands within a run ----------------------------------------------------------
 
 
-def _follow(client: StationClient, given: argparse.Namespace) -> int:
-    status = follow_command(client, given.command, arguments(given), _silent if given.json else _print)
-    _show(status, given.json)
+def _follow(client: StationClient, options: argparse.Namespace) -> int:
+    status = follow_command(client, options.command, arguments(options), _silent if options.json else _print)
+    _show(status, options.json)
     return _outcome("" if status["state_is"]["ready"] else f"{status['state']}, {status['reason']}")
 
 
 def _run_and_wait(
-    client: StationClient, given: argparse.Namespace, kind: str, said: dict[str, Any], wants: str = ""
+    client: StationClient, options: argparse.Namespace, kind: str, fields: dict[str, Any], wants: str = ""
 ) -> int:
     """Send one command and return the exit code; with --wait, wait until the command has ended.
 
     `wants` is the event without which the command has failed, "" if none is needed.
     """
     before = client.status()
-    client.command(kind, **said)
-    if not getattr(given, "wait", False):
-        _show(client.status(), given.json)
+    client.command(kind, **fields)
+    if not getattr(options, "wait", False):
+        _show(client.status(), options.json)
         return DONE
-    settled = wait_until_settled(client, before, _silent if given.json else _print_event)
-    _show(settled.status, given.json)
+    settled = wait_until_settled(client, before, _silent if options.json else _print_event)
+    _show(settled.status, options.json)
     return _outcome(settled.failure(wants))
 
 
@@ -97,7 +97,7 @@ def _print_event(event: dict[str, Any]) -> None:
         watch.print_event(event)
 
 
-def _silent(what: object) -> None:
+def _silent(value: object) -> None:
     """Ignore an event: a program that reads the output needs only the outcome."""
 
 
@@ -108,119 +108,119 @@ def _show(status: dict[str, Any], as_json: bool) -> None:
 # --- commands with ways of their own -------------------------------------------------------------------------
 
 
-def _setup(client: StationClient, given: argparse.Namespace) -> int:
-    if not given.cancel:
-        return _follow(client, given)
+def _setup(client: StationClient, options: argparse.Namespace) -> int:
+    if not options.cancel:
+        return _follow(client, options)
     status = client.status()
     if not status["state_is"]["preparing"]:  # else it would stop a run
         raise Refused(f"there is no set-up to cancel: the station is {status['state']}")
-    return _run_and_wait(client, given, "stop", {})
+    return _run_and_wait(client, options, "stop", {})
 
 
-def _run(client: StationClient, given: argparse.Namespace) -> int:
-    collect = client.status()["collect"] if given.arm else None
-    if given.arm and not (collect and collect["armed"]):
+def _run(client: StationClient, options: argparse.Namespace) -> int:
+    collect = client.status()["collect"] if options.arm else None
+    if options.arm and not (collect and collect["armed"]):
         client.command("arm")
-    return _follow(client, given)
+    return _follow(client, options)
 
 
-def _approach(client: StationClient, given: argparse.Namespace) -> int:
+def _approach(client: StationClient, options: argparse.Namespace) -> int:
     if client.status()["state_is"]["going"]:
-        return _run_and_wait(client, given, "approach", {}, "motion_done")
-    return _follow(client, given)
+        return _run_and_wait(client, options, "approach", {}, "motion_done")
+    return _follow(client, options)
 
 
-def _move(client: StationClient, given: argparse.Namespace) -> int:
+def _move(client: StationClient, options: argparse.Namespace) -> int:
     return _run_and_wait(
-        client, given, "move", aim_text.aim_arguments(client, given) | _speed(given), "motion_done"
+        client, options, "move", aim_text.aim_arguments(client, options) | _speed(options), "motion_done"
     )
 
 
-def _jog(client: StationClient, given: argparse.Namespace) -> int:
+def _jog(client: StationClient, options: argparse.Namespace) -> int:
     """Show the result of an aim, and move there: exactly to the joints that were shown.
 
     Raises: Refused if they are not the requested pose, unless --nearest is given.
     """
-    aim = client.query("aim", **aim_text.aim_arguments(client, given)).data
-    _show_aim(client, aim, given)
+    aim = client.query("aim", **aim_text.aim_arguments(client, options)).data
+    _show_aim(client, aim, options)
     short = aim_text.aim_problem(aim)
-    if short and not given.nearest:
+    if short and not options.nearest:
         raise Refused(f"it cannot go there: {short}; allowed: a smaller step, or --nearest")
-    return _run_and_wait(client, given, "move", {"joints": aim["joints"]} | _speed(given), "motion_done")
+    return _run_and_wait(client, options, "move", {"joints": aim["joints"]} | _speed(options), "motion_done")
 
 
-def _aim(client: StationClient, given: argparse.Namespace) -> int:
-    aim = client.query("aim", **aim_text.aim_arguments(client, given)).data
-    _show_aim(client, aim, given)
+def _aim(client: StationClient, options: argparse.Namespace) -> int:
+    aim = client.query("aim", **aim_text.aim_arguments(client, options)).data
+    _show_aim(client, aim, options)
     return FAILED if aim_text.aim_problem(aim) else DONE
 
 
-def _speed(given: argparse.Namespace) -> dict[str, float]:
-    return {} if given.speed is None else {"speed": given.speed}
+def _speed(options: argparse.Namespace) -> dict[str, float]:
+    return {} if options.speed is None else {"speed": options.speed}
 
 
-def _show_aim(client: StationClient, aim: Any, given: argparse.Namespace) -> None:
-    if given.json:
+def _show_aim(client: StationClient, aim: Any, options: argparse.Namespace) -> None:
+    if options.json:
         print(json.dumps(dict(aim)), flush=True)
         return
     names = client.status()["facts"]["joint_names"]
     commanded = client.query("aim").data["joints"]
-    speed = getattr(given, "speed", None) or 1.0
+    speed = getattr(options, "speed", None) or 1.0
     print("\n".join(aim_text.aim_lines(aim, commanded, names, speed)), flush=True)
 
 
-def _tune(client: StationClient, given: argparse.Namespace) -> int:
-    said = arguments(given)
-    if said:
-        client.command("tune", **said)
+def _tune(client: StationClient, options: argparse.Namespace) -> int:
+    fields = arguments(options)
+    if fields:
+        client.command("tune", **fields)
     status = client.status()
-    if given.json:
+    if options.json:
         print(json.dumps({"strategy": status["tuning"], "task": status["task"]}))
     else:
-        print("\n  ".join(tuning_lines(status, everything=given.show)))
+        print("\n  ".join(tuning_lines(status, everything=options.show)))
         print(f"task: {status['task'] or 'none'}")
     return DONE
 
 
-def _record(client: StationClient, given: argparse.Namespace) -> int:
-    return _run_and_wait(client, given, f"record_{given.what}", {})
+def _record(client: StationClient, options: argparse.Namespace) -> int:
+    return _run_and_wait(client, options, f"record_{options.what}", {})
 
 
-def _release(client: StationClient, given: argparse.Namespace) -> int:
+def _release(client: StationClient, options: argparse.Namespace) -> int:
     client.command("release")
-    _show(client.wait(lambda status: not status["state_is"]["latched"], _RELEASE_S), given.json)
+    _show(client.wait(lambda status: not status["state_is"]["latched"], _RELEASE_S), options.json)
     return DONE
 
 
-def _estop(client: StationClient, given: argparse.Namespace) -> int:
-    ack = client.estop(given.why)
+def _estop(client: StationClient, options: argparse.Namespace) -> int:
+    ack = client.estop(options.why)
     print(
         json.dumps({"status": ack.status, "reason": ack.reason})
-        if given.json
+        if options.json
         else f"{ack.status}: {ack.reason}"
     )
     return DONE if ack.status == "done" else FAILED
 
 
-def _status(client: StationClient, given: argparse.Namespace) -> int:
+def _status(client: StationClient, options: argparse.Namespace) -> int:
     status = client.status()
-    told = (
+    text = (
         json.dumps(status, indent=1, default=str)
-        if given.json
+        if options.json
         else "\n".join(status_report(status, client.holder))
     )
-    print(told)
+    print(text)
     return DONE
 
 
-def _wait(client: StationClient, given: argparse.Namespace) -> int:
-    status = client.wait(lambda status: given.what in (status["state"], status["phase"]), given.timeout)
-    _show(status, given.json)
+def _wait(client: StationClient, options: argparse.Namespace) -> int:
+    status = client.wait(lambda status: options.what in (status["state"], status["phase"]), options.timeout)
+    _show(status, options.json)
     return DONE
 
 
-def _watch(client: StationClient, given: argparse.Namespace) -> int:
-    return watch.watch(client, given.json)
+def _watch(client: StationClient, options: argparse.Namespace) -> int:
+    return watch.watch(client, options.json)
 
 
 _OWN_WAYS = {

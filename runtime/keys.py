@@ -17,14 +17,14 @@ from runtime.link.enrolment import enrol
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return 0 on success, 1 on failure, after printing the reason."""
-    given = _parser().parse_args(arguments)
-    data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+    options = _parser().parse_args(arguments)
+    data = Path(options.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
     try:
-        if given.what == "new":
-            key = key_files.make_station_key(data, given.replace)
+        if options.what == "new":
+            key = key_files.make_station_key(data, options.replace)
             print(f"the key of this computer is made: {codes.fingerprint(key.public)}")
-        elif given.what == "enrol":
-            _enrol(data, given.address, given.code)
+        elif options.what == "enrol":
+            _enrol(data, options.address, options.code)
         else:
             _show(data)
     except RuntimeFault as fault:
@@ -36,18 +36,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m runtime.keys", description=__doc__)
     parser.add_argument("--data-dir", type=Path, metavar="DIR", help="$EVA_DATA_DIR or ./data if not given")
-    what = parser.add_subparsers(dest="what", required=True)
-    new = what.add_parser("new", help="make the key of this computer")
+    actions = parser.add_subparsers(dest="what", required=True)
+    new = actions.add_parser("new", help="make the key of this computer")
     new.add_argument("--replace", action="store_true", help="in place of the one that it has")
-    asking = what.add_parser("enrol", help="make a station of this computer one of a lab")
+    asking = actions.add_parser("enrol", help="make a station of this computer one of a lab")
     asking.add_argument("address", metavar="ADDRESS", help="HOST:PORT, as the lab's administration shows it")
     asking.add_argument("code", metavar="CODE", nargs="+", help="the one-time code that it shows")
-    what.add_parser("show", help="the key of this computer, and the labs of its stations")
+    actions.add_parser("show", help="the key of this computer, and the labs of its stations")
     return parser
 
 
-def _enrol(data: Path, address: str, words: Sequence[str]) -> None:
-    code = codes.read(" ".join(words))
+def _enrol(data: Path, address: str, code_parts: Sequence[str]) -> None:
+    code = codes.read(" ".join(code_parts))
     key = key_files.station_key(data)
     print(f"the lab's key   {codes.fingerprint(code.lab)}")
     print(f"this computer's {codes.fingerprint(key.public)}")
