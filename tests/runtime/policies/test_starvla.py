@@ -382,8 +382,9 @@ def test_pings_go_out_while_nobody_asks_until_it_is_closed() -> None:
                 enough.set()
 
     with serving(converse) as url, policy_at(url, ping_every=0.02) as policy:
+        before = set(threading.enumerate())
         policy.connect()
-        (thread,) = [thread for thread in threading.enumerate() if thread.name == "starvla-ping"]
+        (thread,) = [one for one in set(threading.enumerate()) - before if one.name == "starvla-ping"]
         assert enough.wait(PATIENCE_S)
         policy.close()
         joined(thread)

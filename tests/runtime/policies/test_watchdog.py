@@ -17,7 +17,11 @@ class Watched:
     def __init__(self) -> None:
         self.cut = threading.Event()
         self.cuts = 0
-        self.dog = Watchdog("watched", self._count)
+        self.name = f"watched {id(self)}"  # that of the test before may be at its end yet
+        self.dog = Watchdog(self.name, self._count)
+
+    def threads(self) -> list[threading.Thread]:
+        return [thread for thread in threading.enumerate() if thread.name == self.name]
 
     def _count(self) -> None:
         self.cuts += 1
@@ -27,10 +31,6 @@ class Watched:
 @pytest.fixture
 def watched() -> Watched:
     return Watched()
-
-
-def threads() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "watched"]
 
 
 def test_what_takes_too_long_is_cut_once_and_knows_it(watched: Watched) -> None:
@@ -66,11 +66,11 @@ def test_a_later_one_does_not_take_an_earlier_cut_for_its_own(watched: Watched) 
 def test_it_is_one_thread_for_all_and_none_after_the_end(watched: Watched) -> None:
     for _ in range(5):
         with watched.dog.deadline(LONG):
-            assert len(threads()) == 1
-    thread = threads()[0]
+            assert len(watched.threads()) == 1
+    thread = watched.threads()[0]
     watched.dog.stop()
     joined(thread)
-    assert not threads()
+    assert not watched.threads()
     assert watched.cuts == 0
 
 
