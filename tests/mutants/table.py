@@ -177,8 +177,8 @@ MUTANTS = (
     Mutant(
         "leases/epoch-begins-anew",
         _LEASES,
-        'return 1 + max(int(held["epoch"])',
-        'return 1 + min(int(held["epoch"])',
+        'return 1 + max(int(lease["epoch"])',
+        'return 1 + min(int(lease["epoch"])',
         _OF_LEASES,
     ),
     Mutant(
@@ -227,8 +227,8 @@ MUTANTS = (
     Mutant(
         "blinding/code-of-the-slot",
         "evaweb/plans/allocation.py",
-        'blinding.draw_codes(bytes(held.key or b""), number)[-1]',
-        'blinding.draw_codes(bytes(held.key or b""), slot.index + 1)[-1]',
+        'blinding.draw_codes(bytes(locked.key or b""), number)[-1]',
+        'blinding.draw_codes(bytes(locked.key or b""), slot.index + 1)[-1]',
         _OF_PLANS,
     ),
     Mutant(
@@ -270,8 +270,8 @@ MUTANTS = (
     Mutant(
         "journal/time-without-a-zone",
         _JOURNAL,
-        "if found is None or found.tzinfo is None or not",
-        "if found is None or not",
+        "if moment is None or moment.tzinfo is None or not",
+        "if moment is None or not",
         _OF_JOURNAL,
     ),
     Mutant(
@@ -313,8 +313,8 @@ MUTANTS = (
     Mutant(
         "statistics/alpha-for-one-side",
         "evaweb/statistics/sequential.py",
-        "if min(one, other) <= alpha / 2:",
-        "if min(one, other) <= alpha:",
+        "if min(value_first, value_second) <= alpha / 2:",
+        "if min(value_first, value_second) <= alpha:",
         ("tests/evaweb/statistics/test_sequential.py",),
     ),
     Mutant(
