@@ -47,7 +47,7 @@ class StationEventIngester:
         self._collects: bool | None = None  # value in the station's row; None: not known yet
         self._swept = 0.0
         self._failing = False
-        self._thread = threading.Thread(target=self._run, name=f"{station} chronicle", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"{station} events", daemon=True)
 
     def start(self) -> None:
         """Subscribe to the feed and start the thread."""
@@ -196,7 +196,7 @@ class EventIngest:
         self._feeds = heard
         self._scribes: dict[str, StationEventIngester] = {}
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="chronicle", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="events", daemon=True)
 
     def start(self) -> None:
         """Start the thread; returns at once."""

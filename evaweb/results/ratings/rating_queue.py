@@ -38,7 +38,7 @@ from runtime.core.sentences import Pattern, fixed
 
 _TRIAL_RATED_BY_SECOND_PERSON = Pattern(
     "results.ratings.judging.trial_rated_by_second_person",
-    "trial {trial} is to be rated by a second person, and that may be you: rate it first (Result, Rate again), "
+    "trial {trial} is to be rated by a second person, and that may be you: rate it first (Result, Second ratings), "
     "then correct its score",
 )
 _TRIAL_NOT_ONE_THOSE_RATED = Pattern(
