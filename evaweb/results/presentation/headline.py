@@ -46,7 +46,7 @@ _UNDECIDED = 6  # format from which too few trials are reported as undecided
 class Headline:
     """Headline: a sentence per planned comparison, how they were decided, and alternative headlines.
 
-    An alternative is "" if it would be from the same blocks.
+    An alternative is "" if it would be concluded from exactly the same outcomes as the headline.
 
     Attributes:
         corrected: Alternative with the scores as corrected after the reveal.
@@ -181,7 +181,8 @@ def _ranks(design: Design, arms: Sequence[str], results: Findings) -> bool:
 def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
     """Return the sentence on the best of three or more checkpoints, or on those that no comparison found worse.
 
-    "" if it was not asked for or is not decided, or if a test of scores only shows that they differ.
+    Return "" unless all checkpoints were compared with each other and every comparison has ended. Return "" too for a
+    fixed number of trials compared by scores: that test only shows whether two checkpoints differ.
     """
     document = plan.document or {}
     arms, results = arms_of(compared(document)), findings(found, blocks)
@@ -253,9 +254,10 @@ def _sentence(
 
 
 def _could_separate(plan: Plan, design: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
-    """Return True if this many trials could have separated the pair.
+    """Return True if this many trials could have separated the pair at all.
 
-    That is so if they separate it when every trial of its first checkpoint succeeds and every other one fails.
+    That is checked with the most extreme outcomes: every trial of the pair's first checkpoint succeeds, and every other
+    trial fails.
     """
     if (plan.document or {}).get("format", 1) < _UNDECIDED:
         return True

@@ -33,7 +33,7 @@ _CELL = 30
 def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing | None:
     """Draw x/n by initial condition (rows) and checkpoint (columns), darker for more successes.
 
-    `links` by checkpoint and condition lead to the trials.
+    `links` maps (checkpoint, condition) to the address of a list of these trials. Return None without trials.
     """
     conditions = sorted({name for arm in arms for name in arm.cells}, key=_natural)
     if not conditions or not arms:

@@ -47,7 +47,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Drawn:
-    """New draws for an interval: 2.5 % of `lower` are below its lower end, 2.5 % of `upper` above its upper end."""
+    """Newly drawn samples for checking an interval.
+
+    The lower end of the interval is the 2.5 % quantile of `lower`, its upper end the 97.5 % quantile of `upper`.
+    """
 
     lower: list[float]
     upper: list[float]
@@ -279,10 +282,10 @@ def _time(trials: Trials, timing: Timing) -> dict[str, Any]:
 
 
 def _drawn(strata: Sequence[Sequence[float]], low: float, high: float) -> Drawn:
-    """Return new draws of means over strata of outcomes from 0 to 1, scaled to [low, high].
+    """Return new draws of the mean over `strata` of outcomes from 0 to 1, scaled to [low, high].
 
-    The weights are gaps between uniform numbers; one extra gap is given to 0 for the lower end, to 1 for the upper
-    end.
+    In each draw the outcomes of a stratum get random weights, which are gaps between sorted uniform numbers. There is
+    one more gap than outcomes: its weight goes to the value 0 for the lower end, to 1 for the upper end.
     """
     chance, drawn = random.Random(1), Drawn([], [])
     counted = [list(Counter(values).items()) for values in strata]
