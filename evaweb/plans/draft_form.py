@@ -98,7 +98,7 @@ class _Draft(forms.Form):
         return round(float(self.cleaned_data["second_rater_share"]) / _POINTS, 6)
 
     def clean_margin(self) -> float | None:
-        """Convert percentage points to a fraction; None if the question is whether two differ."""
+        """Convert percentage points to a fraction; None if the plan asks whether two checkpoints differ."""
         points = self.cleaned_data["margin"]
         if self.cleaned_data.get("kind") != "margin":
             return None

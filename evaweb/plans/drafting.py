@@ -91,9 +91,10 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
 
 
 def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None:
-    """Set the comparison's first and second checkpoint from control and challenger.
+    """Set the comparison's first and second checkpoint from the control and the challenger in `values`.
 
-    `roles` are control and challenger before the change; they apply to those that are hidden from the user.
+    `roles` are control and challenger before the change. They are kept if `values` has HIDDEN in their place, because
+    the user may not know them.
     """
     control, challenger = roles
     control = control if values["control"] == HIDDEN else _number(values["control"])
