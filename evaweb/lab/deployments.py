@@ -171,10 +171,11 @@ def write_draft(
 def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
     """Rename the deployment's cameras so that each name fits the image.
 
-    `shown` maps each name to the camera whose image it shows.
+    `shown` maps each camera's present name to the name that fits its image.
 
     Raises:
-        EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.
+        EvaError: If a name is given to two images, or if a camera to be renamed gets its name from the robot's node
+            instead of the deployment.
     """
     stored = stored_deployment(name)
     tree = tree_of(stored.path) if stored else {}
