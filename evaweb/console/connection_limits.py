@@ -138,7 +138,7 @@ class _Connection(ProtocolWrapper):
 
 
 class LimitedFactory(WrappingFactory):
-    """Factory of Daphne's connections that registers each with `arrivals`."""
+    """Factory of Daphne's connections; each waiting connection is registered with the limiter `arrivals`."""
 
     protocol = _Connection
     noisy = False
