@@ -437,7 +437,7 @@ def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tupl
 
 
 def of_so_many(found: Design, blocks: int) -> Design:
-    """Return the design of one comparison for `blocks` pairs instead; looks beyond them are omitted."""
+    """Return the design `found` of one comparison, but planned for `blocks` blocks; looks beyond them are omitted."""
     schedule = look_schedule(found) if found.rule in SHAPES else []
     shortened = design(
         rule=found.rule,
