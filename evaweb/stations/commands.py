@@ -112,11 +112,18 @@ def issue_command(
 ) -> Command:
     """Send a command and return its row with the answer; if the uuid was used before, return the first row.
 
-    Args:
-        boot, sequence: Boot id and number of the snapshot that the page showed.
-        vouched: Arguments that come from an administrator's table or the lab's records instead of the user.
-
     Never call it within a transaction: other processes could not write until the station has answered.
+
+    Args:
+        user: User who commands.
+        station: Station to command.
+        kind: Kind of command.
+        args: Arguments of the command.
+        page: Id of the page that holds the lease.
+        epoch: Epoch of the lease.
+        boot, sequence: Boot id and number of the snapshot that the page showed.
+        uuid: Uuid of the command, None for a new one.
+        vouched: Names of arguments that come from an administrator's table or the lab's records instead of the user.
 
     Raises:
         NotAllowed: The user lacks the role.
@@ -259,7 +266,10 @@ def _send(row: Command, command: messages.Command) -> Command:
 
 
 def _require_sendable(command: messages.Command) -> None:
-    """Raise EvaError if the command cannot be encoded, before its row exists and is resolved for an hour."""
+    """Raise EvaError if the command cannot be encoded.
+
+    To be called before its row is written: the outcome of a row without an answer is queried for an hour.
+    """
     try:
         messages.encode(command)
     except CodecError as error:
