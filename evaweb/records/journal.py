@@ -212,9 +212,10 @@ class Journal(Generic[AnyLine]):
         append_line(self.path(uuid), line)
 
     def read(self, uuid: UUID, say: Callable[[str], None]) -> list[AnyLine]:
-        """Return all valid lines of the file, oldest first, including those of other journals in the folder.
+        """Return all valid lines of the file of `uuid`, oldest first.
 
-        A truncated or invalid line is skipped: `say` is called with file, line number and field.
+        If several journals share the folder, the lines of all of them are returned. A truncated or invalid line is
+        skipped: `say` is called with file, line number and field.
         """
         path, records, lines = self.path(uuid), [], _reader(_kinds[self.folder])
         for number, line in read_numbered_lines(path):
