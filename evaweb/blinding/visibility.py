@@ -97,9 +97,10 @@ class Visibility:
         return self.redact_text(trial.reason)
 
     def redact_text(self, text: str, covered: str = HIDDEN) -> str:
-        """Return a station's message without hidden data; a Sentence with its id only if fully shown.
+        """Return a station's message without hidden data.
 
-        `covered` replaces a message that must be hidden entirely.
+        A Sentence keeps its id and arguments, by which it is translated, only if all of them may be shown. `covered`
+        replaces a message that must be hidden entirely.
         """
         redacted = text
         if text and not _HARMLESS.fullmatch(text):
