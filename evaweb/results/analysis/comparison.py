@@ -99,8 +99,12 @@ class ComparedTrials:
     """Trials of two checkpoints, from which the statistics of their comparison are computed.
 
     Attributes:
-        test: Barnard's test, `corrected` by Holm's procedure.
+        first: Trials of the first checkpoint.
+        second: Trials of the second checkpoint.
+        test: Barnard's test of their success rates.
+        corrected: p-value of `test` after Holm's correction.
         alpha: This comparison's share of alpha.
+        timing: Horizon of times to success.
         in_pairs: False for checkpoints in random order.
         whole: Whether these are all trials of a plan.
     """

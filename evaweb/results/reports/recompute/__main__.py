@@ -1,6 +1,7 @@
 """Recomputes every number of this report and prints those that differ.
 
-Exit code: 0 if all agree, 1 if one differs, 2 if nothing contradicts but without a key rewriting cannot be excluded.
+Exit code: 0 if all agree, 1 if one differs. It is 2 if all agree, but the plan's key is not revealed: it can then not
+be excluded that the data were rewritten consistently.
 """
 
 from __future__ import annotations

@@ -159,7 +159,10 @@ def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, A
 
 
 def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:
-    """Remove inference from an open comparison; only descriptions and the evidence that is its design remain."""
+    """Remove all tests and evidence from an open comparison, so that only descriptions remain.
+
+    If the design is a test by e-values (`stopping`), the evidence on its outcome remains too.
+    """
     own = {"success": "evidence", "score": "score_evidence"}[stopping.get("outcome") or "success"]
     for name in (
         *("barnard", "probability_better", "mcnemar", "scores", "over_scenes", "evidence"),
