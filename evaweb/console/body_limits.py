@@ -132,7 +132,7 @@ class BoundedRequest(WebRequest):
             self._too_long()
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:
-        """Process the complete request, unless it was refused already."""
+        """Pass the complete request to the application, unless it was refused already."""
         self._whole = True
         if not (self._over and self._bound.status):
             super().requestReceived(command, path, version)
@@ -144,7 +144,7 @@ class BoundedRequest(WebRequest):
         self.handle_reply({"type": "http.response.body", "body": content})
 
     def connectionLost(self, reason: object) -> None:
-        """Handle a lost connection; an e-stop whose headers are complete is still processed."""
+        """End the request because its connection is lost; first execute it if it is an e-stop with complete headers."""
         headed = not self._whole and hasattr(self, "_bound")
         presses = headed and (_ESTOP.fullmatch(self._path) or (self._over and not self._bound.status))
         if presses and self.channel._command == b"POST":

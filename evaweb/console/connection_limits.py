@@ -89,7 +89,7 @@ class Request(BoundedRequest):
         self.channel.transport.sent()
 
     def process(self) -> None:
-        """Process the complete request: a stop at once, any other request in its turn of the event loop."""
+        """Pass the complete request to the application: a stop at once, any other in its turn of the event loop."""
         self.channel.transport.sent()
         if is_stop(self.path):
             super().process()
