@@ -331,9 +331,10 @@ def _merged(row: Command) -> Command:
 
 
 def _merged_fields(row: Command, first: Command) -> list[str]:
-    """Return the fields in which this record of a stop is better than the first, which arrived on another path.
+    """Return the names of fields that `row`, a record of a stop, can add to `first`, which arrived on another path.
 
-    These are the answer, if it was lost or not carried out there, and the user, if unknown there.
+    They are those of the answer, if `first` has none, or none by which the stop was carried out, and those of the user,
+    if `first` has no user.
     """
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"
