@@ -44,10 +44,10 @@ class Funnel:
 
 @dataclass(frozen=True, slots=True)
 class FailureMode:
-    """Phase and cause of failure ("" if unspecified) of `count` out of `n` trials, with the exact interval of the
-    share.
+    """Phase and cause of failure ("" if unspecified) of `count` out of `n` trials.
 
-    The interval is valid for a single mode named beforehand; for the most frequent of many it is too optimistic.
+    `interval` is the exact interval of the share `count` / `n`. It is valid for a single mode that was named
+    beforehand; for the most frequent of many modes it is too optimistic.
     """
 
     phase: str

@@ -139,8 +139,9 @@ def rule_text(plan: Plan) -> str:
 
 
 def sentence_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """Return the design's conclusion from these blocks: the best checkpoint, if asked for, and one sentence
-    per comparison.
+    """Return the design's conclusion from these blocks: one sentence per comparison.
+
+    A sentence on the best checkpoint precedes them, if there is one (see `best_of`).
     """
     return ". ".join(filter(None, (best_of(plan, found, blocks), *sentences_of(plan, found, blocks))))
 
@@ -156,8 +157,9 @@ def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[st
 
 
 def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tuple[str, str], ...]:
-    """Return the letters of checkpoints that were all compared with each other, best first; () otherwise, or
-    if not ended.
+    """Return (name, letters) of each checkpoint, best first; two that share a letter were not separated.
+
+    () unless all checkpoints were compared with each other and every comparison has ended.
     """
     names = compared(plan.document or {})
     arms = arms_of(names)
@@ -339,7 +341,10 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
 
 
 def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
-    """Return the current trials with the outcomes in `decided`; unchanged if `decided` is not from the same trials."""
+    """Return `now` with the outcomes in `decided` as those that count.
+
+    It is returned unchanged if `decided` is not from the same trials.
+    """
     if len(now.counted) != len(decided):
         return now
     outcomes: list[Block] = []

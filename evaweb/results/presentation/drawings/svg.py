@@ -118,7 +118,7 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
 
 
 def counted(found: Proportion) -> tuple[object, ...]:
-    """Return the cells for a proportion in the columns PROPORTION."""
+    """Return the values of a proportion for the columns whose names are in PROPORTION."""
     interval = found.interval
     return (found.successes, found.n, found.rate, interval and interval.low, interval and interval.high)
 

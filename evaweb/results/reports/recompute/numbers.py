@@ -414,7 +414,10 @@ def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
 
 
 def _tables(first: Trials, second: Trials, key: str) -> dict[str, tuple[int, int, int, int]]:
-    """Return successes and trials of both in each stratum in which both were tried."""
+    """Return (successes, trials, successes, trials) of both checkpoints for each stratum in which both were tried.
+
+    `key` names the field of a trial that is its stratum.
+    """
     first_groups, second_groups = ({getattr(t, key): [] for t in arm} for arm in (first, second))
     for arm, groups in ((first, first_groups), (second, second_groups)):
         for trial in arm:
