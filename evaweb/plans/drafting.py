@@ -38,8 +38,8 @@ class Changed:
 def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
     """Return the values of the draft that its pages edit, without hidden checkpoints.
 
-    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint compared with it if the
-    plan has more than two; with two it is None, because it is the remaining one.
+    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint that is compared with it.
+    If the plan has only these two checkpoints, `challenger` is None, because it follows from `control`.
     """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     control, challenger = _roles(plan)

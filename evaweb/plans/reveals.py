@@ -48,9 +48,9 @@ def first_reveal(plan: Plan) -> RevealLine | None:
 
 
 def write_reveal(plan: Plan, user: User, at: datetime) -> None:
-    """Write a reveal, or the close of an open plan, and complete its `at_reveal`.
+    """Write the journal line of a reveal, or of the close of an open plan.
 
-    Call it before the row is saved. Raises: NotWritten.
+    `plan.at_reveal` is completed with user, commitment and key. Call it before the row is saved. Raises: NotWritten.
     """
     by = user.get_username()
     if plan.at_reveal is not None:
