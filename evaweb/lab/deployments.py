@@ -327,11 +327,13 @@ def _require_no_holder(station: Station) -> None:
 
 
 def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
-    """Check that the keys in BY_HAND, which only a person with access to the machine may set, have their defaults.
+    """Refuse values that would make this machine run a program: keys in BY_HAND must have their defaults.
+
+    Only a person with access to the machine may set such keys, in the file.
 
     Raises:
-        EvaError: If one has another value.
-        ConfigurationError: If the kind does not exist.
+        EvaError: If such a key has another value.
+        ConfigurationError: If `typed` has a kind that does not exist for this `part`.
     """
     for entry in draft.entries(part, typed.get("kind", "")):
         value = typed.get(entry.key, "").strip()
