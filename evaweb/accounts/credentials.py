@@ -261,9 +261,10 @@ class CredentialCache:
             return self._nobodys.get(key, -float("inf")) > self._clock()
 
     def _check(self, kind: str, secret: str, share: str | None = None) -> Future[Login | None]:
-        """Start a lookup without waiting; callers with the same question share it.
+        """Start a lookup without waiting; further callers share the pending lookup of the same credential and share.
 
-        With `share` None the login is cached: such lookups have their own threads and do not wait behind unknown ones.
+        `share` is None for a credential with a cached login: its lookups have their own threads and do not wait behind
+        those of unknown credentials.
         """
         key = ((kind, digest(secret)), share)
         with self._lock:
