@@ -68,7 +68,7 @@ class TriggerSpec:
 
     @property
     def names(self) -> Mapping[str, str]:
-        """Trigger names by event."""
+        """Names of the triggers by SQL event (UPDATE, DELETE, INSERT, TRUNCATE)."""
         names = {
             "UPDATE": "kept",
             "DELETE": "never_removed",

@@ -256,9 +256,10 @@ def _wrong(error: ValidationError) -> str:
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Append one line and sync it to the disk; a line torn by an earlier crash stays a separate line.
+    """Append one line and sync it to the disk.
 
-    The caller holds a database row, so that there is one writer at a time.
+    If a crash left an incomplete line at the end, the new line is still a line of its own. The caller holds the lock of
+    a database row, so that there is one writer at a time.
     Raises: NotWritten, which states whether a partly written line was removed.
     """
     text = json.dumps(
