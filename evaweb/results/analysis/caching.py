@@ -41,7 +41,7 @@ _pages: FingerprintCache[dict[str, Any]] = FingerprintCache()
 
 
 def fingerprint(plan: Plan) -> Hashable:
-    """Return a value that changes whenever an analysis of the plan would."""
+    """Return a value that changes with every change of the data from which the plan is analysed."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     counted: dict[str, Any] = trials.aggregate(
         n=Count("pk"),
