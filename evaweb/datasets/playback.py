@@ -55,7 +55,8 @@ Array = NDArray[Any]
 class PlayedEpisode:
     """Episode of a dataset; `robot` is the robot to which its values belong, "" if unknown.
 
-    `robot_is_assumed`: the user has chosen the robot, whatever the dataset declares, and the values are in its order.
+    `robot_is_assumed` is True if the user has chosen the robot, whatever the dataset declares; the values are then
+    taken in the order of that robot's joints.
     """
 
     name: str  # name of the dataset
