@@ -122,7 +122,10 @@ class _TipTrack:
 
 
 def _measured(episode: Episode) -> _Samples:
-    """Return the joints measured by the robot at their capture times; a tick has the newest sample of any age."""
+    """Return the joints that the robot measured, at their capture times.
+
+    Each tick recorded the newest sample at that time, however old it was.
+    """
     rows, name = episode.rows, "capture_time.joints"
     ticked = rows.column("tick_time").to_numpy()
     captured = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked
