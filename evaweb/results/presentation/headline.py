@@ -311,7 +311,7 @@ def _estimates(plan: Plan, design: Design, blocks: Sequence[Block]) -> Iterator[
 class WorstCase:
     """Conclusion of a comparison with discarded, unscored attempts counted against its winner.
 
-    `same` is True if it still wins.
+    `same` is True if the winner still wins.
     """
 
     sentence: str

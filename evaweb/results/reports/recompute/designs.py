@@ -364,9 +364,10 @@ def _foreseen(plan: Mapping[str, Any]) -> int:
 
 
 def _side(table: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
-    """Return the side (0 or 1) for which the boundary stops at this `look`; None if it does not stop.
+    """Return the side (0 or 1) for which the boundary stops at a look; None if it does not stop.
 
-    `first` and `second` are the successes of both sides.
+    `table` is the boundary's row of that look, `first` and `second` are the successes of the first and the second
+    checkpoint.
     """
     n, m, *least = table
     if margin is not None:  # with a margin it tests its second arm: the first checkpoint
