@@ -92,7 +92,10 @@ def cameras_of(station: Station) -> list[str]:
 
 
 def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
-    """Return the user's camera check if it is still valid; None: they must confirm before their next trial."""
+    """Return the user's newest camera check of the station if it is still valid.
+
+    None if the user must confirm the cameras before the next trial.
+    """
     newest = CameraCheck.objects.filter(station=station, by=user).first()
     if newest is None or newest.boot != station.boot or timezone.now() - newest.at > HOLDS:
         return None
