@@ -164,9 +164,9 @@ class StopGateway:
         ]
 
     def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
-        """Return the scope of a request; for a request of the web's pages with this port's origin instead of the web's.
+        """Return the scope of a request, with this port as its origin if one of the web's pages sent it.
 
-        Django's CSRF check knows only one origin, that of the port where the request arrives.
+        Django's CSRF check accepts only one origin, that of the port where the request arrives.
         """
         host = _header(scope, b"host")
         origin = _header(scope, b"origin")
