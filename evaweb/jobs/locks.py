@@ -69,7 +69,7 @@ def _path(key: str) -> Path:
 def _mark(owner: UUID | None) -> bytes:
     """Return the content of a lock file: the owner of the job, and the boot id of the kernel that granted the lock.
 
-    It identifies the kernel, because locks of another machine may not be visible on this one.
+    The boot id is needed because locks of another machine may not be visible on this one.
     """
     return f"{owner} {_BOOT_ID.read_text().strip()}".encode()
 
