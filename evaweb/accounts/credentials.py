@@ -175,9 +175,10 @@ class CredentialCache:
             self._known.pop((kind, digested), None)
 
     async def resolve_presser(self, found: Sequence[Credential], share: str) -> Login | None:
-        """Return the user who presses the e-stop, from the cache or else the database; None if it knows none of them.
+        """Return the user who presses the e-stop, from the cache or else the database.
 
-        An expired session or token is accepted, so that no press is lost to a date.
+        None if all credentials in `found` are unknown. An expired session or token is accepted, so that no press is
+        lost to a date.
 
         Raises:
             Unverifiable: The database does not respond.
