@@ -1,6 +1,6 @@
 """Conversion of exceptions on pages to HTTP responses; evaweb.api does the same for REST.
 
-Failures before and after a view are handled here too; programs get JSON.
+Failures before and after a view are converted here too. Programs get JSON.
 """
 
 from __future__ import annotations
