@@ -344,9 +344,9 @@ def choices(rows: Courses) -> Iterator[Figure]:
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:
-    """Return the least extreme table that is significant in Barnard's test, as successes of both arms; None if none is.
+    """Return the least extreme table that is significant in Barnard's test, as successes of both arms.
 
-    All more extreme tables are significant, too.
+    All more extreme tables are significant too. None if no table is significant.
     """
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),
