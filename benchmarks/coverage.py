@@ -151,9 +151,9 @@ def _anytime(first: float, second: float) -> Case:
 
 
 def _preferred(chance: Chance, n: int, draws: int) -> bool:
-    """Return True if the interval contains the truth for comparisons of two checkpoints, one worth e times the other.
+    """Return True if the interval contains the truth for comparisons of two checkpoints, or if there is no interval.
 
-    Also True if no interval is shown.
+    The worth of one checkpoint is e times that of the other.
     """
     weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's weights with frequent ties
     preferred = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()

@@ -182,8 +182,8 @@ def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
 def powers(rows: Courses) -> Iterator[Figure]:
     """Yield the power of each design, and of scipy's Barnard test for comparison.
 
-    Required is for *late* at most 0.05 less than for a fixed number of pairs, for *early* at most 0.02 less than for
-    STEP, with at most a tenth more pairs.
+    The power of *late* has to be at least that of a fixed number of pairs minus 0.05. The power of *early* has to be at
+    least that of STEP minus 0.02, with at most a tenth more pairs.
     """
     for name, case in DESIGNS.items():
         for rates, n in SAME if case.margin else DIFFERENT:
@@ -309,9 +309,10 @@ def families(rows: Courses) -> Iterator[Figure]:
 def choices(rows: Courses) -> Iterator[Figure]:
     """Yield figures on choosing the best of several checkpoints, with all trials or with dropping.
 
-    They are: how often a wrong checkpoint is called the best, how often the best one is, how often the highest rate
-    among the remaining ones is not that of the best, and the median number of trials. Among equal checkpoints none is
-    the best.
+    `best.wrong` is how often a wrong checkpoint is called the best, `best.found` how often the right one is,
+    `best.chosen_wrong` how often the highest observed rate among the remaining checkpoints is not that of the best one,
+    and `best.trials` the median number of trials. If several checkpoints have the highest rate, to call any of them the
+    best is wrong.
     """
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
     for rates in _CHOICES:
@@ -343,9 +344,9 @@ def choices(rows: Courses) -> Iterator[Figure]:
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:
-    """Return the least extreme table that is significant in Barnard's test, as successes of both arms; None if none is.
+    """Return the least extreme table that is significant in Barnard's test, as successes of both arms.
 
-    All more extreme tables are significant, too.
+    All more extreme tables are significant too. None if no table is significant.
     """
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),

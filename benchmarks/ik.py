@@ -204,8 +204,8 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 def _postures(name: str) -> list[Figure]:
     """Return figures of the default backend on loops and long paths.
 
-    `far` paths have one leg anywhere within the limits. For figures ending with `chunks`, a path is solved chunk by
-    chunk, so that only the current chunk is known.
+    A `far` path has only one leg, to a posture anywhere within the limits. For figures ending with `chunks`, a path is
+    solved chunk by chunk, so that only the current chunk is known.
     """
     robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[_DEFAULT]

@@ -60,9 +60,9 @@ def measure(seconds: float) -> Report:
     """Measure a lab with a linked station; presses and idling last `seconds` each.
 
     The figures are `estop_p99_ms` from a page through the link, `estop_here_p99_ms` at the station, and `lost_shown_s`;
-    `cpu_percent` and `memory_mb` of an idle station with its link, and of the lab's gate. During a transfer at full
-    speed: `upload_mb_s`, processor time of both ends, and presses. `stations_max` and `viewers_max` as in
-    `benchmarks.climb`, with half of `seconds` per step.
+    `cpu_percent` and `memory_mb` of an idle station with its link, and of the lab's gate. For a transfer at full speed
+    they are `upload_mb_s`, the processor time of both ends, and the delay of presses meanwhile. `stations_max` and
+    `viewers_max` are measured by `benchmarks.climb`, with half of `seconds` per step.
     """
     os.environ["EVA_UPLOAD_MB_S"] = "50"
     with tempfile.TemporaryDirectory() as name:

@@ -89,8 +89,8 @@ def measure(seconds: float) -> Report:
 def table(seconds_budget: float) -> list[dict[str, Any]]:
     """Return a row for each strategy and delay [ticks]; distances in mm, means over the episodes.
 
-    Each is measured with three motions of the belt, or more if the budget allows: the same for the same budget on every
-    machine.
+    Each is measured with at least three motions of the belt; a larger budget allows more. Their number depends on the
+    budget alone, not on the speed of the machine.
     """
     seeds = range(max(SEEDS, int(seconds_budget / _PER_SEED_S)))
     cases = list(product(STRATEGIES, DELAYS, seeds))

@@ -47,7 +47,7 @@ RUNNING = "select key, owner from jobs_job where status = 'running'"
 
 @dataclass(frozen=True, slots=True)
 class KillCount:
-    """Number of kills: `most`; after `seconds` only as many as are needed for `least`."""
+    """Number of kills: `most`, or as many as can be made in `seconds` [s], but at least `least`."""
 
     most: int
     least: int

@@ -88,7 +88,7 @@ def main(text: str) -> None:
 
 
 class _Player:
-    """Detector of the end of a recording."""
+    """Receiver of observations that sets `over` once the recording has ended."""
 
     def __init__(self) -> None:
         self.over = False

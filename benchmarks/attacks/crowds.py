@@ -67,7 +67,7 @@ def _head(target: Target, lines: str) -> bytes:
 async def _crowd(target: Target, size: int, head: bytes, then: _Then) -> Counter[str]:
     """Keep `size` connections open, and replace each that ends; return the number of answers by kind.
 
-    Each sends `head`, and `then` uses it after the answer.
+    On each connection `head` is sent; after the answer, `then` is called with the connection.
     """
     counts: Counter[str] = Counter()
     first_answers = [asyncio.Event() for _ in range(target.part(size))]

@@ -216,8 +216,8 @@ class Scenario(Bench):
     def _check_grippers(self, action: Float64, stopped: bool) -> None:
         """Check that grippers are commanded open or closed, and do not switch too often.
 
-        In between is allowed if the command does not change, or if the first command is that of an e-stop (`stopped`).
-        `action` [D] is the command of this tick.
+        `action` [D] is the command of this tick. A gripper may be commanded to a position in between if its command
+        does not change, or if the first command is the one of an e-stop (`stopped`).
         """
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]

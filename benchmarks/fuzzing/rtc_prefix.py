@@ -250,8 +250,9 @@ class PrefixKeepingPolicy(Policy):
         return np.asarray(joints)
 
     def _continued(self, rows: Float64, left: Float64, fixed: int) -> Float64:
-        """Return the rows with the `fixed` first ones from `left`, and a transition to their own values within
-        6 more.
+        """Return `rows` with the first `fixed` ones replaced by those of `left`.
+
+        The next 6 rows are a transition from `left` to the policy's own rows.
         """
         count = min(len(left), len(rows), fixed + 6)
         weights = np.clip((fixed + 6 - np.arange(count)) / 7.0, 0.0, 1.0)
@@ -292,7 +293,7 @@ class Planned:
     end: int
 
     def arrived_for(self, step: int) -> int:
-        """Return from which step on the first answer to a request at `step` or later is the plan.
+        """Return the step from which on the plan is that of the first answer to a request at `step` or later.
 
         Without such an answer, return the end of the run: lost answers fix nothing.
         """

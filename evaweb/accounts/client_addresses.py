@@ -43,7 +43,12 @@ def client_key(scope: dict[str, Any]) -> str:
 def _caller(
     peer: str | None, named: list[str], proxies: Iterable[IPv4Network | IPv6Network]
 ) -> Address | None:
-    """Return the last named address that a trusted proxy has seen itself; any client can invent the ones before it."""
+    """Return the client's address: `peer`, unless that is a trusted proxy.
+
+    `named` are forwarded addresses, to which each proxy appends the one that it got the request from. They are followed
+    from the last one backwards as long as the address reached is a trusted proxy's. Those before are ignored, because
+    any client can invent them.
+    """
     address = _parsed(peer)
     while named and address is not None and any(address in network for network in proxies):
         before = _parsed(named.pop().strip())

@@ -25,7 +25,10 @@ def cookie_values(headers: Iterable[str], name: str) -> list[str]:
 
 
 def session_keys(headers: Iterable[str]) -> list[str]:
-    """Return the session keys that a browser sent, but at most MOST; known ones are preferred if there are more."""
+    """Return the session keys that a browser sent, but at most MOST.
+
+    Of more keys, those with a known session are preferred.
+    """
     keys = cookie_values(headers, settings.SESSION_COOKIE_NAME)
     return keys if len(keys) <= MOST else sorted(keys, key=_is_strange)[:MOST]
 

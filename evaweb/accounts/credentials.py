@@ -175,9 +175,10 @@ class CredentialCache:
             self._known.pop((kind, digested), None)
 
     async def resolve_presser(self, found: Sequence[Credential], share: str) -> Login | None:
-        """Return the user who presses the e-stop, from the cache or else the database; None if it knows none of them.
+        """Return the user who presses the e-stop, from the cache or else the database.
 
-        An expired session or token is accepted, so that no press is lost to a date.
+        None if all credentials in `found` are unknown. An expired session or token is accepted, so that no press is
+        lost to a date.
 
         Raises:
             Unverifiable: The database does not respond.
@@ -261,9 +262,10 @@ class CredentialCache:
             return self._nobodys.get(key, -float("inf")) > self._clock()
 
     def _check(self, kind: str, secret: str, share: str | None = None) -> Future[Login | None]:
-        """Start a lookup without waiting; callers with the same question share it.
+        """Start a lookup without waiting; further callers share the pending lookup of the same credential and share.
 
-        With `share` None the login is cached: such lookups have their own threads and do not wait behind unknown ones.
+        `share` is None for a credential with a cached login: its lookups have their own threads and do not wait behind
+        those of unknown credentials.
         """
         key = ((kind, digest(secret)), share)
         with self._lock:

@@ -105,7 +105,7 @@ class AccountAdmin(UserAdmin):
         return (*self.readonly_fields, "username") if obj else self.readonly_fields
 
     def get_form(self, request: HttpRequest, obj: User | None = None, **named: Any) -> Any:
-        """Return the form class with the user who edits."""
+        """Return the form class with the attribute `asking`, the administrator who edits the account."""
         form = super().get_form(request, obj, **named)
         return type(form.__name__, (form,), {"asking": request.user})
 

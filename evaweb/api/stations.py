@@ -136,7 +136,10 @@ class LeaseIn(Body):
 
 
 def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
-    """Reject a `trial` in the args: a trial's run is checked first, see evaweb.trials.station_commands."""
+    """Return `args`. Raise ValueError if they name a trial, which has a field of its own.
+
+    A run with that field is checked against the trial first, see evaweb.trials.station_commands.
+    """
     if "trial" in args:
         raise ValueError("args name a trial: name it beside them, as `trial`")
     return args

@@ -1,8 +1,8 @@
 """Stops over REST, answered in front of Django: without the database and without a thread of a page.
 
-It answers e-stop, stop and halt of a station, and whether this path to them works. All other requests are passed to
-the application; evaweb.api.stations documents the requests. It runs in front of the web, and alone in the process for
-stops (`stop_application`).
+Answered here are e-stop, stop and halt of a station, and requests by which a page tests that these would be answered.
+All other requests are passed to the application. The requests are documented in evaweb.api.stations. The gateway runs
+in front of the web, and alone in the process for stops (`stop_application`).
 """
 
 from __future__ import annotations
@@ -97,7 +97,10 @@ class Refused(EvaError):
 
 
 class StopGateway:
-    """ASGI application for stops in front of another one; `web_port` is set in the separate process for stops."""
+    """ASGI application that answers stops, and passes all other requests to `application`.
+
+    `web_port` is the port of the web whose pages it serves, if it runs in the separate process for stops; else None.
+    """
 
     def __init__(self, application: Callable[..., Awaitable[Any]], web_port: int | None = None) -> None:
         self._application, self._web_port = application, web_port
@@ -161,8 +164,9 @@ class StopGateway:
         ]
 
     def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
-        """Return the scope with the origin of this port for requests of the web's pages, because Django knows
-        one origin only.
+        """Return the scope of a request, with this port as its origin if one of the web's pages sent it.
+
+        Django's CSRF check accepts only one origin, that of the port where the request arrives.
         """
         host = _header(scope, b"host")
         origin = _header(scope, b"origin")

@@ -52,10 +52,16 @@ _HARMLESS = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Visibility:
-    """Data hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
+    """Data hidden from one user: checkpoints of blind plans, in trials, episodes and at stations.
 
-    `stations`: names of stations at which a trial of such a plan was handed out; `busy_stations`: those with an
-    unfinished one; `plans`: the plans as text, `keys`: their ids. `user` is the account's id, None without an account.
+    Attributes:
+        checkpoints: Ids of the hidden checkpoints.
+        names: Their names.
+        stations: Names of stations at which a trial of a plan that is blind for the user was handed out.
+        busy_stations: Names of stations with an unfinished trial of such a plan.
+        keys: Ids of these plans.
+        plans: Titles of these plans as text.
+        user: Id of the account, None without an account.
     """
 
     checkpoints: frozenset[int] = frozenset()
@@ -97,9 +103,10 @@ class Visibility:
         return self.redact_text(trial.reason)
 
     def redact_text(self, text: str, covered: str = HIDDEN) -> str:
-        """Return a station's message without hidden data; a Sentence with its id only if fully shown.
+        """Return a station's message without hidden data.
 
-        `covered` replaces a message that must be hidden entirely.
+        A Sentence keeps its id and arguments, by which it is translated, only if all of them may be shown. `covered`
+        replaces a message that must be hidden entirely.
         """
         redacted = text
         if text and not _HARMLESS.fullmatch(text):

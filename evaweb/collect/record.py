@@ -20,7 +20,7 @@ _OPENED = ("station", "dataset", "task", "setup")  # constant values
 
 
 class EventLine(Line):
-    """Event of a session; the first, `opened`, also has all constant values."""
+    """Event of a session; the first event, `opened`, also has the values that stay constant during the session."""
 
     ELSEWHERE: ClassVar = frozenset[str]()
 

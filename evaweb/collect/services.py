@@ -175,8 +175,8 @@ def publish_session(
 ) -> list[Job]:
     """Queue the publication of the accepted episodes with these results that are in no dataset yet.
 
-    `version` is that of a new dataset; "" for the default, or the existing dataset's. Raises: Conflict if there is
-    nothing to publish, or the dataset has another version.
+    `version` is the version of a new dataset. "" selects the version of the existing dataset or, for a new one, the
+    default. Raises: Conflict if there is nothing to publish, or the dataset has another version.
     """
     require_role(user, Role.OPERATOR)
     allowed = [result.value for result in Result if result.value]

@@ -94,7 +94,11 @@ def _refused(reason: str) -> dict[str, Any]:
 def query_aim(
     station: str, username: str, args: Mapping[str, Any], looks: DrawnRobot | None
 ) -> dict[str, Any]:
-    """Return the station's answer about a target; `links` [P * 16] in it are the poses of the links at that target."""
+    """Return the station's answer about a target, as JSON.
+
+    `links` [P * 16] in it are the poses of the parts of `looks`, the robot as drawn, at that target; [] if there are
+    none.
+    """
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:
         messages.encode(command)  # an encoding error is the page's fault, not the station's

@@ -1,7 +1,8 @@
 """Limits of request bodies, enforced before a view is called.
 
 Twisted passes a request to Daphne, and Daphne to Django, after the whole body has arrived: too late for a view to
-refuse it. So a long body is refused because of its headers, or as soon as it exceeds the limit, and never stored.
+refuse it. Therefore a long body is refused here, by the length in its headers or as soon as it exceeds the limit, and
+never stored.
 """
 
 from __future__ import annotations
@@ -42,11 +43,17 @@ _LINGER_S = (
 
 @dataclass(frozen=True, slots=True)
 class BodyBound:
-    """Limit of a request body (`largest`, in bytes), and the refusal of a longer one.
+    """Limit of a request body, and the refusal of a longer one.
 
-    With status 0 a longer body is dropped and the request continues. A body longer than `sure` is accepted only if the
-    first session of `keys` that has a user is an administrator's. With `may_press`, the first `largest` bytes of a
-    longer body decide whether it is an e-stop press; if it is, the rest of the body is dropped.
+    Attributes:
+        largest: Limit [bytes].
+        status: HTTP status of the refusal. 0 means no refusal: a longer body is dropped and the request continues.
+        sentence: Message of the refusal.
+        sure: Limit [bytes] of users other than administrators. The user of a longer body is the one of the first
+            session in `keys` that has a user.
+        keys: Keys of the sessions that the request names.
+        may_press: Whether the request may be an e-stop press. If it is one, according to the first `largest` bytes of a
+            longer body, the rest of the body is dropped.
     """
 
     largest: int
@@ -125,7 +132,7 @@ class BoundedRequest(WebRequest):
             self._too_long()
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:
-        """Process the complete request, unless it was refused already."""
+        """Pass the complete request to the application, unless it was refused already."""
         self._whole = True
         if not (self._over and self._bound.status):
             super().requestReceived(command, path, version)
@@ -137,7 +144,7 @@ class BoundedRequest(WebRequest):
         self.handle_reply({"type": "http.response.body", "body": content})
 
     def connectionLost(self, reason: object) -> None:
-        """Handle a lost connection; an e-stop whose headers are complete is still processed."""
+        """End the request because its connection is lost; first execute it if it is an e-stop with complete headers."""
         headed = not self._whole and hasattr(self, "_bound")
         presses = headed and (_ESTOP.fullmatch(self._path) or (self._over and not self._bound.status))
         if presses and self.channel._command == b"POST":

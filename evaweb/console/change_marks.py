@@ -24,7 +24,10 @@ ChangeMarks = dict[str, Any]
 
 
 async def read_marks(station: str) -> ChangeMarks | None:
-    """Return the station's current marks, or None if the database does not answer, which stops nothing live."""
+    """Return the station's current marks; None if the database does not answer.
+
+    In that case the page keeps receiving live data, which do not depend on the database.
+    """
     try:
         return await database_sync_to_async(change_marks, thread_sensitive=False)(station)
     except Error as error:

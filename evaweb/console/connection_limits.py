@@ -89,7 +89,7 @@ class Request(BoundedRequest):
         self.channel.transport.sent()
 
     def process(self) -> None:
-        """Process the complete request: a stop at once, any other request in its turn of the event loop."""
+        """Pass the complete request to the application: a stop at once, any other in its turn of the event loop."""
         self.channel.transport.sent()
         if is_stop(self.path):
             super().process()
@@ -138,7 +138,7 @@ class _Connection(ProtocolWrapper):
 
 
 class LimitedFactory(WrappingFactory):
-    """Factory of Daphne's connections that registers each with `arrivals`."""
+    """Factory of Daphne's connections; each waiting connection is registered with the limiter `arrivals`."""
 
     protocol = _Connection
     noisy = False

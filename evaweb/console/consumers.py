@@ -190,7 +190,12 @@ class StationConsumer(AsyncWebsocketConsumer):
             await self.close(NEW_ROLE, f"you are {now.with_article} now")
 
     async def receive(self, text_data: str | None = None, bytes_data: bytes | None = None) -> None:
-        """Handle one message of the page."""
+        """Parse one message of the page and carry out its request.
+
+        Messages without a login are ignored. Stops are always carried out. Any other message beyond the page's quota
+        closes the socket. Messages that arrive before the database has named the user are queued, except renewals of a
+        lease by a recently known user.
+        """
         text = text_data or _decode_binary(bytes_data or b"")
         if not self._session or (self._over and not requests.may_be_stop(text)):
             return

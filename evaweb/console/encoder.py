@@ -87,7 +87,7 @@ class StreamEncoder:
         return []
 
     def _update_robot(self, facts: Any) -> None:
-        """Draw the robot with the groups that the station reports."""
+        """Replace the drawn robot if the station reports other groups of joints than before."""
         groups = facts.get("groups") if isinstance(facts, Mapping) else None
         if groups and tuple(groups) != self._groups:
             self._groups = tuple(groups)

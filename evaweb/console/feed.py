@@ -84,10 +84,10 @@ class _Reader(ABC):
 
     @abstractmethod
     def on_messages(self, found: Mapping[str, Any]) -> None:
-        """Handle the newest message of each stream that had one."""
+        """Pass on the newest message of each stream that had one; `found` maps streams to their content."""
 
     def on_silence(self, reason: str) -> None:  # noqa: B027  # who reads pictures leaves it to who reads the state
-        """Handle missing messages; `reason` is the explanation."""
+        """Report that no messages arrive, with the reason."""
 
     def _run(self) -> None:
         while not self._ended.is_set():

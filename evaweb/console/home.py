@@ -168,7 +168,10 @@ def alarms() -> Iterator[Item]:
 
 
 def _cameras_lost(state: Mapping[str, Any]) -> str:
-    """Return the cameras whose newest image is too old; [] unless the station's joints arrive."""
+    """Return the names of the cameras whose newest image is too old, joined by commas.
+
+    "" if there is none, or if the robot's joints do not arrive either: in that case the cause is not the cameras.
+    """
     ages = dict(state.get("link", {}).get("ages", {}))
     joints = ages.pop("joints", None)
     if joints is None or not joints < _OLD_S:

@@ -217,7 +217,7 @@ class StationRoom:
 
 
 class LiveHub:
-    """Rooms of one event loop."""
+    """Rooms of all stations with open pages; for one event loop only."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, heard: Feeds = feeds) -> None:
         self._loop = loop

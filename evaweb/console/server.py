@@ -57,8 +57,14 @@ def serve(
 ) -> None:
     """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; print the address as JSON.
 
-    The priority is lowered by `nice` only when serving has begun: starting takes seconds of processor time, which
-    would become half a minute at low priority on a busy machine.
+    Args:
+        application: ASGI application.
+        listener: Listening socket, which belongs to the server from then on.
+        beside: Service that is started and stopped with the server, None for no such service.
+        lifeline: Whether to stop at the end of standard input.
+        request: Class of the requests.
+        nice: Niceness added once serving has begun. Starting takes seconds of processor time, which would become half a
+            minute at low priority on a busy machine.
     """
     sys.setswitchinterval(_TURN_S)
     address = _address(listener)

@@ -238,7 +238,10 @@ def readable_by_others(path: Path) -> bool:
 
 
 def _make_private(path: Path) -> None:
-    """Make the file private; a file of another account stays and evaweb.core.file_checks warns at every start."""
+    """Set mode 600 of a file that others can read.
+
+    A file of another account cannot be changed; evaweb.core.file_checks warns about it at every start.
+    """
     if readable_by_others(path):
         with suppress(PermissionError):
             path.chmod(0o600)

@@ -44,9 +44,21 @@ def import_dataset(
     reencode: bool = False,
     tell: Callable[[str], None] = lambda _: None,
 ) -> ImportResult:
-    """Import a LeRobot dataset of any version as the dataset `to`, by default named as its folder.
+    """Import a LeRobot dataset of any version as a dataset of this lab.
 
-    Episodes imported before are unchanged, so that an interrupted import can be continued. Raises: RecordingError.
+    Episodes imported before are unchanged, so that an interrupted import can be continued.
+
+    Args:
+        dataset: Folder of the dataset to import.
+        to: Name of the new dataset, "" for that of the folder.
+        state: Column of the measured joints, "" for the first column with a usual name.
+        robot: Robot to which the values belong, "" if unknown.
+        rename: New names of features.
+        reencode: Allow images to be encoded anew if they cannot be copied.
+        tell: Receives progress messages.
+
+    Raises:
+        RecordingError: The dataset cannot be imported.
     """
     if not rename:
         resolve_source_robot(open_dataset(dataset), state, robot)  # fails before anything is copied

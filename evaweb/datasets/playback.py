@@ -55,7 +55,8 @@ Array = NDArray[Any]
 class PlayedEpisode:
     """Episode of a dataset; `robot` is the robot to which its values belong, "" if unknown.
 
-    `robot_is_assumed`: the user has chosen the robot, whatever the dataset declares, and the values are in its order.
+    `robot_is_assumed` is True if the user has chosen the robot, whatever the dataset declares; the values are then
+    taken in the order of that robot's joints.
     """
 
     name: str  # name of the dataset
@@ -161,10 +162,11 @@ def _vectors(dataset: Dataset) -> list[str]:
 
 
 def as_recording(shown: PlayedEpisode) -> Episode:
-    """Return the episode with the tables of a recording; also with the three action streams if a sidecar has them.
+    """Return the episode with the tables of a recording, so that it can be played like one.
 
-    If state and action have different dimensions, the joints are the names of the state followed by those of the
-    action.
+    If a sidecar has the raw, smoothed and executed action streams, they are included. If state and action have
+    different dimensions, all of them become joints: first those of the state, then those of the action; the measured
+    values of the latter, and the commanded values of the former, are NaN.
     Raises: RecordingError.
     """
     table = shown.dataset.table(shown.index)

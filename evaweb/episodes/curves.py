@@ -36,14 +36,18 @@ def curve_message(
 ) -> bytes:
     """Return one message of evaweb.core.binary_frames with the curves of a recording.
 
-    Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (one row per joint):
-    ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN if nothing was planned or
-    sent), safety u1 [M] (1 changed, 2 refused), chunk i4 [M] (with the largest weight, -1 no chunk, 0 the held target),
-    makers i4 [M + 1]: tick k consists of the entries makers[k] to makers[k + 1] of stream makers.
-    makers: chunk i4 [W], weight f4 [W]. raw, if the policy answers in joints: time f8 [R], values f4 [D, R],
-    chunk i4 [R]. chunks: see evaweb.episodes.chunks.
+    Times are seconds of the video, in which row k is at k / fps. Vectors are stored joint by joint (one row per joint).
+    The streams are:
+
+    * ticks, at the control rate: time f8 [M]; measured, smoothed and executed f4 [D, M] (NaN if nothing was planned or
+      sent); safety u1 [M] (1 changed, 2 refused); chunk i4 [M], the one with the largest weight (-1 no chunk, 0 the
+      held target); makers i4 [M + 1]: tick k consists of the entries makers[k] to makers[k + 1] of stream makers.
+    * makers: chunk i4 [W], weight f4 [W].
+    * raw, if the policy answers in joints: time f8 [R], values f4 [D, R], chunk i4 [R].
+    * chunks: see evaweb.episodes.chunks.
 
     Args:
+        folder: Folder of the recording.
         covered: Omit all data that reveal the policy, as if its answers had not been recorded.
         unscored: Omit the data of the ground truth that reveal the outcome.
         milestones: (time of the run [s], text) as scored; if empty, those of the ground truth are marked.

@@ -30,7 +30,14 @@ CONTENT_TYPE = "application/vnd.apache.parquet"
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """State of an episode's table: "ready", "preparing", "failed", "absent" or "none"; `size` is in bytes."""
+    """State of an episode's table.
+
+    Attributes:
+        name: "ready"; "preparing", while its job waits or runs; "failed"; "absent" if it can be requested; "none" if
+            there can be no table, because the recording is unfinished, missing, or on another computer.
+        sentence: Reason for a failure or for waiting, "" if there is none.
+        size: Size of a table that is ready [bytes].
+    """
 
     name: str
     sentence: str = ""

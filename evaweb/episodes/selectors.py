@@ -162,7 +162,7 @@ def playback_stage(*, episode: Episode) -> PlaybackStage:
 
 
 def why_unrecorded(*, episode: Episode | None) -> str:
-    """Return why there is no evidence that a run moved anything (no recorded row); "" if there is."""
+    """Return why no recorded row proves that a run moved anything; "" if at least one row is recorded."""
     if episode is None:
         return "nothing of its run was recorded"
     if episode.frames:

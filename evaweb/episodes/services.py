@@ -129,8 +129,9 @@ def create_missing_episode(*, station: Station, uuid: UUID, **facts: Any) -> Epi
 def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
     """Update the row from the folder, and queue a preview if there is something to play.
 
-    Raises: RecordingError if the folder is absent or damaged, or is not that of the closed recording; the row is
-    unchanged then, and verified next.
+    Raises: RecordingError if the folder is absent or damaged, or has another outcome than the one with which the
+    recording was closed. The row is then unchanged; after a changed outcome the recording is among the next to be
+    verified.
     """
     recorded = read_recorded_episode(journal_folder(uuid))
     row = Episode.objects.filter(uuid=uuid, status__in=CLOSED).first()
@@ -156,9 +157,9 @@ def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
 
 
 def outcome_change(row: Episode, seal: str | None) -> str:
-    """Return how the outcome of a closed episode has changed, as words that follow its name; "" if unchanged.
+    """Return how the outcome file of a closed episode has changed, as words that follow its name; "" if unchanged.
 
-    `seal` is that of the present outcome: None if there is no outcome, "" if it has no seal.
+    `seal` is the seal in the present file: None if the file is absent, "" if it has no seal.
     """
     if seal is None:
         return f"is absent, though the recording was closed as {row.status}"

@@ -21,7 +21,10 @@ QUALITY = 70
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Layout of a sheet: tile k, row by row, covers rows from k * `every` on; `across` x `down` tiles."""
+    """Layout of a sheet of `across` x `down` tiles, which follow each other as in a text.
+
+    Tile k shows one image of `every` consecutive rows of the episode, the first of which is k * `every`.
+    """
 
     every: int
     across: int

@@ -2,8 +2,9 @@
 
 SPARC was made for the speed of a hand (Balasubramanian et al. 2015), and is comparable between robots with different
 joints. Positions are computed from the joints by the robot's description, while the robot was asked to move: a robot
-held for its operator is not jerky. The measured value counts, at capture times; the commanded one is free of sensor
-noise and of smoothing by the robot's own controller.
+held for its operator is not jerky. The result of a run is the value of the measured motion, at capture times. The value
+of the commanded motion is reported in addition: it is free of sensor noise and of smoothing by the robot's own
+controller.
 """
 
 from __future__ import annotations
@@ -35,10 +36,14 @@ _LEAST_RATE = 0.95 * 2 * CUT_OFF  # least rate of observations [1/s]; tolerates 
 
 @dataclass(frozen=True, slots=True)
 class Smoothness:
-    """Smoothness of a run: mean over its arms weighted by path length.
+    """Smoothness of a run: means over its arms, weighted by path length.
 
-    It is None if unknown, and `why` is the reason. `arms` has the arms that moved: name -> {"measured", "commanded":
-    SPARC or None, "measured_m", "commanded_m": path length [m]}.
+    Attributes:
+        measured: SPARC of the measured motion, None if unknown.
+        commanded: SPARC of the commanded motion, None if unknown.
+        arms: For each arm that moved, by name: "measured" and "commanded" (SPARC or None), and "measured_m" and
+            "commanded_m" (path length [m]).
+        why: Reason for an unknown measured value, else "".
     """
 
     measured: float | None
@@ -117,7 +122,10 @@ class _TipTrack:
 
 
 def _measured(episode: Episode) -> _Samples:
-    """Return the joints measured by the robot at their capture times; a tick has the newest sample of any age."""
+    """Return the joints that the robot measured, at their capture times.
+
+    Each tick recorded the newest sample at that time, however old it was.
+    """
     rows, name = episode.rows, "capture_time.joints"
     ticked = rows.column("tick_time").to_numpy()
     captured = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked

@@ -86,7 +86,10 @@ def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
 
 
 def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
-    """Return the result of a verification; damaged if a closed recording has no outcome any more, or another one."""
+    """Return `verdict`, or "damaged" in its place if the row contradicts it.
+
+    That is the case if the row is that of a closed recording, and the outcome on the disk is absent or another one.
+    """
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
     reason = outcome_change(row, None if verdict.state == "open" else verdict.seal)

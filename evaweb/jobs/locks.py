@@ -1,7 +1,7 @@
 """One lock file per running job, held by the kernel for as long as the worker's process lives.
 
-Two jobs with the same key never run at the same time on one disk, and a killed worker is detected immediately if it is
-certain: its lock is free, and this same kernel granted it. Otherwise the database's times decide.
+Two jobs with the same key never run at the same time on one disk. The death of a worker is detected immediately if the
+lock proves it: the lock is free, and this same kernel granted it. Otherwise the times in the database decide.
 """
 
 from __future__ import annotations
@@ -67,7 +67,10 @@ def _path(key: str) -> Path:
 
 
 def _mark(owner: UUID | None) -> bytes:
-    """Return owner and kernel boot id of a lock: locks of another machine may not be visible on this one."""
+    """Return the content of a lock file: the owner of the job, and the boot id of the kernel that granted the lock.
+
+    The boot id is needed because locks of another machine may not be visible on this one.
+    """
     return f"{owner} {_BOOT_ID.read_text().strip()}".encode()
 
 

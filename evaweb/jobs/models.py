@@ -95,7 +95,10 @@ class LabFolder(models.Model):
 
 
 class Hold(models.Model):
-    """Name on which no two jobs work at a time, and the job that holds it; void once that job has another owner."""
+    """Name, for example of a dataset, that a running job holds, so that no other job works on it meanwhile.
+
+    It is void once the job has ended or has another owner.
+    """
 
     what = models.CharField(max_length=1024, unique=True)
     job = models.ForeignKey(Job, on_delete=models.CASCADE, related_name="holds")

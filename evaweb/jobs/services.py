@@ -62,7 +62,7 @@ _ending = threading.Event()
 def enqueue(*, kind: str, key: str, args: Args) -> Job:
     """Queue a job; if one with that key is already queued, update its args and return it.
 
-    A running job with that key does not count: its subject may have changed since it read it.
+    A running job with that key is not enough, because its subject may have changed since that job read it.
     """
     queue = declared(kind).queue
     with transaction.atomic():

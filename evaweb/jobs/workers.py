@@ -1,8 +1,9 @@
 """Registry of running workers, and jobs that none of them can execute.
 
-A worker serves the queues that it was started with. Most kinds need the lab's data folder; a worker with another folder
-executes only the other kinds. With SQLite there is one machine, whose folder it is. Otherwise the web declares it: a
-worker on another machine with its own, empty folder would report the lab's recordings as missing.
+A worker serves the queues that it was started with. Most kinds of jobs need the lab's data folder; a worker with
+another folder executes only the other kinds. With SQLite there is only one machine, and its data folder is the lab's.
+With another database the web declares its own data folder as the lab's: a worker on another machine with its own, empty
+folder would report the lab's recordings as missing.
 """
 
 from __future__ import annotations

@@ -171,10 +171,11 @@ def write_draft(
 def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
     """Rename the deployment's cameras so that each name fits the image.
 
-    `shown` maps each name to the camera whose image it shows.
+    `shown` maps each camera's present name to the name that fits its image.
 
     Raises:
-        EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.
+        EvaError: If a name is given to two images, or if a camera to be renamed gets its name from the robot's node
+            instead of the deployment.
     """
     stored = stored_deployment(name)
     tree = tree_of(stored.path) if stored else {}
@@ -326,11 +327,13 @@ def _require_no_holder(station: Station) -> None:
 
 
 def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
-    """Check that the keys in BY_HAND, which only a person with access to the machine may set, have their defaults.
+    """Refuse values that would make this machine run a program: keys in BY_HAND must have their defaults.
+
+    Only a person with access to the machine may set such keys, in the file.
 
     Raises:
-        EvaError: If one has another value.
-        ConfigurationError: If the kind does not exist.
+        EvaError: If such a key has another value.
+        ConfigurationError: If `typed` has a kind that does not exist for this `part`.
     """
     for entry in draft.entries(part, typed.get("kind", "")):
         value = typed.get(entry.key, "").strip()

@@ -63,7 +63,7 @@ class DraftForm:
 
     @property
     def tables(self) -> dict[str, dict[str, str]]:
-        """Typed values by place of each table that is to be written."""
+        """Kind and typed values of each table to be written, by the table's place in the deployment."""
         return {
             part.place: {
                 "kind": part.kind,

@@ -105,7 +105,7 @@ _TITLES = {
 def walk(*, name: str = "") -> Walk:
     """Return the steps of the station called `name`, which need not have a database row yet.
 
-    If there is no such station, they are those of the newest.
+    If there is no such station, return the steps of the newest station.
     """
     stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
     stored = stored_deployment(name) if name else None

@@ -35,8 +35,8 @@ class Lab:
     ) -> None:
         """Start worker and web at once, so that a second core starts them in parallel with benches and stations.
 
-        `listener` is the socket of the process for stops. It stays open as long as the lab, so that presses wait in it
-        while that process restarts.
+        `listener` is the listening socket of the process that answers stops. It stays open as long as the lab, so that
+        stop requests wait in it while that process restarts.
         """
         self.processes, self.progress = processes, progress
         self._listener = listener

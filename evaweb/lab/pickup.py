@@ -32,7 +32,7 @@ class Pickup:
         self._told: dict[str, Standing] = {}
 
     def poll(self) -> None:
-        """Continue the current start, else begin that of the next file that is new or was touched.
+        """Continue the start of a station, or begin that of the next one whose file is new or was touched.
 
         Errors never end the lab or its other stations.
         """

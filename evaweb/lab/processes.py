@@ -170,7 +170,7 @@ class ChildProcesses:
         child.process.stdin.close()
 
     def _ended(self, child: _Child, now: float) -> bool:
-        """Return True if the child has ended; kill it if its time is over."""
+        """Return True if the child has ended; kill it if it has not ended by itself in time."""
         if child.process.poll() is not None:
             child.log.close()
             return True

@@ -76,7 +76,7 @@ def bench(seed: int, width: int, height: int) -> tuple[str, ...]:
 
 
 def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> ProgramSpec:
-    """Return the program of a simulated bench; it picks free ports, and has them again after a restart."""
+    """Return the program of a simulated bench; it picks free ports, and uses the same ports after a restart."""
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
         ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
@@ -94,7 +94,7 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
 def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
     """Return the program of a simulated leader, which demonstrates the bench's task.
 
-    It picks a free port, and has it again after a restart.
+    It picks a free port, and uses the same port after a restart.
     """
 
     def arguments(endpoint: str) -> tuple[str, ...]:
@@ -118,7 +118,7 @@ def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tup
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
     """Return the program that serves a scripted policy on `port`.
 
-    0 picks a free port, which it has again after a restart.
+    With 0 it picks a free port, and uses the same port after a restart.
     """
 
     def arguments(port: object) -> tuple[str, ...]:

@@ -11,7 +11,10 @@ _EVERY_S = 10.0
 
 
 class Progress:
-    """Progress as "2 of 6 the simulated bench ...", never silent for long."""
+    """Printer of the steps of a start, for example "2 of 6 the simulated bench".
+
+    During a long step it prints a line every few seconds.
+    """
 
     def __init__(self, write: Callable[[str], object], steps: int) -> None:
         """Initialise; `write` prints a line and flushes it."""

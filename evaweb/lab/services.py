@@ -1,4 +1,4 @@
-"""Diagnostic bundles: requested by an administrator, and downloadable by the same one."""
+"""Diagnostic bundles: requested by an administrator, who alone can download them."""
 
 from __future__ import annotations
 

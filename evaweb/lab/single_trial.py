@@ -209,7 +209,10 @@ def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], label: str)
 
 
 def wait_for_recording(visitor: RestClient, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the trial as soon as its duration is that of its recording; until then it is that of the commands."""
+    """Wait until the trial's duration is the exact one of its recording, and return the trial.
+
+    Until then the duration is computed from the events of the run.
+    """
     recorded: Mapping[str, Any] = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda facts: facts["duration_s"] == episode["duration_s"],

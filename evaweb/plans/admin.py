@@ -154,9 +154,10 @@ class PlanAdmin(admin.ModelAdmin):
         return super().formfield_for_manytomany(db_field, request, **kwargs)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
-        """Return the read-only fields: those of a frozen plan; of a draft of a later version only the name.
+        """Return the read-only fields.
 
-        All versions share the name.
+        Of a frozen plan they are all fields of the design, of the draft of a later version only the name, because all
+        versions share it. Another draft has none.
         """
         if obj is None:
             return ()

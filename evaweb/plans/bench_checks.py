@@ -92,7 +92,10 @@ def cameras_of(station: Station) -> list[str]:
 
 
 def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
-    """Return the user's camera check if it is still valid; None: they must confirm before their next trial."""
+    """Return the user's newest camera check of the station if it is still valid.
+
+    None if the user must confirm the cameras before the next trial.
+    """
     newest = CameraCheck.objects.filter(station=station, by=user).first()
     if newest is None or newest.boot != station.boot or timezone.now() - newest.at > HOLDS:
         return None
@@ -139,8 +142,8 @@ def references(*, station: Station, position: Position | None) -> dict[str, Refe
 def record_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
     """Make the current images the references of a position or, if `position` is None, of the cameras themselves.
 
-    Older references stay in the record. Regions keep their place in the picture. Raises: Conflict if a running plan
-    uses one of the references as a gate.
+    Older references stay in the record. Each new reference gets the regions of the one that it replaces, at the same
+    place in the picture. Raises: Conflict if a running plan uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
     images = image_store.current_images(station, cameras_of(station))
@@ -167,7 +170,8 @@ def record_references(*, user: User, station: Station, position: Position | None
 def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
     """Create a reference with the same picture and the regions `drawn`: [{"name", "x", "y", "width", "height"}, ...].
 
-    Raises: Conflict if there is a newer one, or a running plan with a least match has used this camera's reference.
+    Raises: Conflict if there is a newer reference, or if trials of a running plan with a match gate were compared with
+    a reference of this camera.
     """
     require_role(user, Role.OPERATOR)
     regions = region_matching.regions_of(drawn)

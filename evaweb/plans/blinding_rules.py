@@ -2,7 +2,8 @@
 
 Until the reveal every user is blind who has not unblinded the plan. Its owner and administrators may unblind it, a
 recorded act, if they do not run its trials: a user who has been handed a trial cannot unblind, and an unblinded user
-gets no trials. The order decides, so that even the only user of a lab can do either, but not both.
+gets no trials. Thus even the only user of a lab can either run the trials or unblind, whichever comes first, but not
+both.
 
 If a plan is lost with the database, and its trials were restored from the disk, every user is blind.
 """

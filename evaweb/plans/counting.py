@@ -62,9 +62,9 @@ def require_scored_first(plan: Plan, before: Trial | None) -> None:
 
 
 def fails_by(plan: Plan, trial: Trial) -> bool:
-    """Return True if the trial is a failure by the plan, whatever its score.
+    """Return True if the plan counts the trial as a failure, whatever its score.
 
-    It is not if nothing of its run was recorded, because it could not be scored.
+    A trial of whose run nothing was recorded is not counted as one, because it could not be scored.
     """
     counts = getattr(plan, ended_by(trial) or "on_nothing", CountsAs.JUDGED)
     episode = trial.episode

@@ -339,9 +339,9 @@ def end_at_request(plan: Plan) -> str:
 
 
 def crossed_while_waiting(plan: Plan, since: datetime) -> str:
-    """Return why the plan would have ended at a request for a trial at or after `since`, when a void was requested.
+    """Return why the plan would have ended at or after `since`, but for an open void request; "" if it would not.
 
-    "" if it would not have ended.
+    Such an end was recorded when a trial was requested while the void request was open.
     """
     text = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
     return text or ""

@@ -24,8 +24,11 @@ def read(
 ) -> tuple[Values, dict[str, str]]:
     """Return the values of the valid fields, and messages for the invalid ones by name.
 
-    `hidden` are ids of checkpoints that cannot be chosen; `unseen` is how many of them the draft has. `owners` is
-    whether the owner is a field of the form.
+    Args:
+        given: The posted form.
+        hidden: Ids of checkpoints that the user may not choose, because they are hidden.
+        unseen: Number of hidden checkpoints that the draft has.
+        owners: Whether the form has a field for the owner.
     """
     form = _Draft(given)
     form.unseen = unseen
@@ -98,7 +101,7 @@ class _Draft(forms.Form):
         return round(float(self.cleaned_data["second_rater_share"]) / _POINTS, 6)
 
     def clean_margin(self) -> float | None:
-        """Convert percentage points to a fraction; None if the question is whether two differ."""
+        """Convert percentage points to a fraction; None if the plan asks whether two checkpoints differ."""
         points = self.cleaned_data["margin"]
         if self.cleaned_data.get("kind") != "margin":
             return None

@@ -38,8 +38,8 @@ class Changed:
 def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
     """Return the values of the draft that its pages edit, without hidden checkpoints.
 
-    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint compared with it if the
-    plan has more than two; with two it is None, because it is the remaining one.
+    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint that is compared with it.
+    If the plan has only these two checkpoints, `challenger` is None, because it follows from `control`.
     """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     control, challenger = _roles(plan)
@@ -91,9 +91,10 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
 
 
 def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None:
-    """Set the comparison's first and second checkpoint from control and challenger.
+    """Set the comparison's first and second checkpoint from the control and the challenger in `values`.
 
-    `roles` are control and challenger before the change; they apply to those that are hidden from the user.
+    `roles` are control and challenger before the change. They are kept if `values` has HIDDEN in their place, because
+    the user may not know them.
     """
     control, challenger = roles
     control = control if values["control"] == HIDDEN else _number(values["control"])

@@ -1,7 +1,8 @@
 """Reveals of plans on disk, so that a restored database backup cannot undo them.
 
-DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first line counts, whatever follows. Its
-`at_reveal` has the user, commitment and key at that time: a plan that is frozen again has others.
+The file of a plan is DATA/reveals/UUID.jsonl; the UUID is the first half of the plan's digest. Its first line counts,
+whatever follows. `at_reveal` in the line has user, commitment and key as they were at the reveal, because a plan that
+is frozen again gets another commitment and key.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ def first_reveal(plan: Plan) -> RevealLine | None:
 
 
 def write_reveal(plan: Plan, user: User, at: datetime) -> None:
-    """Write a reveal, or the close of an open plan, and complete its `at_reveal`.
+    """Write the journal line of a reveal, or of the close of an open plan.
 
-    Call it before the row is saved. Raises: NotWritten.
+    `plan.at_reveal` is completed with user, commitment and key. Call it before the row is saved. Raises: NotWritten.
     """
     by = user.get_username()
     if plan.at_reveal is not None:

@@ -217,10 +217,11 @@ def _log(plan: Plan, user: User, flag: int, text: str) -> None:
 def freeze_plan(*, user: User, plan: Plan, seen: str = "") -> Plan:
     """Turn a draft into an immutable document with schedule and commitment, so that trials can be handed out.
 
-    `seen`: digest of the draft as the user sees it. Raises: Conflict if it has changed since.
+    `seen` is the digest of the draft as the user sees it. Raises: Conflict if the draft has changed since.
 
-    If the database was lost and trials of such a plan were restored from the disk, they are assigned to it, and it is
-    closed at once, because their schedule and codes are lost; administrators only.
+    If the database was lost, trials of a plan with this name and version may have been restored from the disk. They are
+    then assigned to this plan, and it is closed at once, because their schedule and codes are lost. Only an
+    administrator may freeze such a plan.
     """
     _require_owner(plan, user)
     if plan.state != PlanState.DRAFT:
@@ -375,10 +376,11 @@ def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | No
 def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
     """Close a running plan whose design has ended, if no trial of it is unfinished and no void is requested.
 
-    If trials are left, it ends only when the next one is requested (`asked`): until then a mistyped score can be
-    corrected, and switching a score back and forth does not reveal which trial is of which checkpoint. A crossed
-    boundary found at a request is recorded whatever is corrected later; otherwise each request would reveal the effect
-    of a correction. The reason states that a boundary was crossed or all pairs are made, never for which checkpoint.
+    If trials are left, the plan is closed only when the next trial is requested (`asked`). Until then a mistyped score
+    can be corrected, and switching a score back and forth does not reveal which trial is of which checkpoint. A
+    boundary that is found crossed at a request is recorded, and counts whatever is corrected later; otherwise each
+    request would reveal the effect of a correction. The recorded reason is that a boundary was crossed or all pairs are
+    made, never for which checkpoint.
     """
     locked = _lock_plan(plan)
     result = findings_of(locked) if locked.state == PlanState.FROZEN else None

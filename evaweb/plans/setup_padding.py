@@ -1,7 +1,8 @@
 """Least durations of a blind trial's set-up stages, so that timing does not reveal its checkpoint.
 
 The stages that wait for the policy are extended to the longest recent duration among the plan's checkpoints at this
-station, plus up to a quarter drawn from the plan's key, so that the slowest checkpoint is not the one that overruns.
+station, plus up to a quarter of it, drawn from the plan's key. Without this addition a stage that exceeds its least
+duration would show that the checkpoint is the slowest one.
 """
 
 from __future__ import annotations

@@ -18,12 +18,18 @@ from django.db.models.signals import post_migrate
 
 @dataclass(frozen=True, slots=True)
 class AppendOnly:
-    """Declaration of the immutable part of a model's rows; a row is never deleted either.
+    """Declaration of the immutable part of a model's rows. A row is never deleted either.
 
-    Protected are all columns except `except_columns`, or only `columns`. `message` is the text of the database error.
-    `condition`: SQL about OLD that selects the protected rows, all if empty. `allowed_changes`: by column, the values
-    that may follow each value; a value that is not listed may change to any. `never`: SQL about OLD and NEW; an update
-    for which one of them is true is refused. `forbidden_inserts`: SQL about NEW that selects rows that are refused.
+    The conditions are SQL about the rows OLD and NEW, before and after a statement.
+
+    Attributes:
+        message: Text of the database error.
+        columns: Protected columns; if empty, all except `except_columns`.
+        except_columns: Columns that may change.
+        condition: Condition about OLD for a row to be protected; "" protects all rows.
+        allowed_changes: By column, the values that may follow each value. A value that is not listed may change to any.
+        never: Conditions about OLD and NEW; an update is refused if any of them is true.
+        forbidden_inserts: Condition about NEW; an insert is refused if it is true.
     """
 
     message: str
@@ -68,7 +74,7 @@ class TriggerSpec:
 
     @property
     def names(self) -> Mapping[str, str]:
-        """Trigger names by event."""
+        """Names of the triggers by SQL event (UPDATE, DELETE, INSERT, TRUNCATE)."""
         names = {
             "UPDATE": "kept",
             "DELETE": "never_removed",

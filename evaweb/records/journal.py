@@ -212,9 +212,10 @@ class Journal(Generic[AnyLine]):
         append_line(self.path(uuid), line)
 
     def read(self, uuid: UUID, say: Callable[[str], None]) -> list[AnyLine]:
-        """Return all valid lines of the file, oldest first, including those of other journals in the folder.
+        """Return all valid lines of the file of `uuid`, oldest first.
 
-        A truncated or invalid line is skipped: `say` is called with file, line number and field.
+        If several journals share the folder, the lines of all of them are returned. A truncated or invalid line is
+        skipped: `say` is called with file, line number and field.
         """
         path, records, lines = self.path(uuid), [], _reader(_kinds[self.folder])
         for number, line in read_numbered_lines(path):
@@ -255,9 +256,10 @@ def _wrong(error: ValidationError) -> str:
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Append one line and sync it to the disk; a line torn by an earlier crash stays a separate line.
+    """Append one line and sync it to the disk.
 
-    The caller holds a database row, so that there is one writer at a time.
+    If a crash left an incomplete line at the end, the new line is still a line of its own. The caller holds the lock of
+    a database row, so that there is one writer at a time.
     Raises: NotWritten, which states whether a partly written line was removed.
     """
     text = json.dumps(

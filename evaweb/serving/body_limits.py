@@ -12,7 +12,13 @@ _KIB = 1024
 
 @dataclass(frozen=True, slots=True)
 class BodyLimit:
-    """Limits of a body: `largest` [bytes], `values` counted by brackets and commas; they apply from `role` upwards."""
+    """Limits of a request body.
+
+    Attributes:
+        largest: Limit of its length [bytes].
+        values: Limit of the number of its JSON values, which is counted by brackets and commas.
+        role: Lowest role whose users may send a body.
+    """
 
     largest: int
     values: int

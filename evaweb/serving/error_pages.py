@@ -1,6 +1,6 @@
 """Conversion of exceptions on pages to HTTP responses; evaweb.api does the same for REST.
 
-Failures before and after a view are handled here too; programs get JSON.
+Failures before and after a view are converted here too. Programs get JSON.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Return the response, or the common form of an error response instead.
+        """Return the response, or the error response with a message that replaces it.
 
-        That replaces an error response without a message, and one in HTML to a program.
+        Replaced is an error response without JSON, if it answers a REST request or has status 405 (method not allowed).
         """
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")

@@ -216,7 +216,8 @@ class Listing:
         """Return all rows as `name`.csv: a queryset in the order of the list, other rows as they come.
 
         Raises:
-            EvaError: The request is invalid (`fault`); a file could not show that it is unfiltered.
+            EvaError: The request is invalid (`fault`). A page then shows the unfiltered list with the reason; a file
+                could not show the reason.
         """
         if self.fault:
             raise EvaError(self.fault)

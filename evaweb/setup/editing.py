@@ -101,7 +101,10 @@ def _around() -> dict[str, Any]:
 
 
 def _corners(station: Station) -> dict[str, Any]:
-    """Return the corners of the area for each camera that is known to look from above."""
+    """Return, for each camera known to look from above, the corners of the bench's area in its image.
+
+    They are shares of the image's width and height.
+    """
     above = [camera for camera in cameras_of(station) if station.simulated and "wrist" not in camera]
     return dict.fromkeys(above, OVERHEAD)
 

@@ -112,11 +112,18 @@ def issue_command(
 ) -> Command:
     """Send a command and return its row with the answer; if the uuid was used before, return the first row.
 
-    Args:
-        boot, sequence: Boot id and number of the snapshot that the page showed.
-        vouched: Arguments that come from an administrator's table or the lab's records instead of the user.
-
     Never call it within a transaction: other processes could not write until the station has answered.
+
+    Args:
+        user: User who commands.
+        station: Station to command.
+        kind: Kind of command.
+        args: Arguments of the command.
+        page: Id of the page that holds the lease.
+        epoch: Epoch of the lease.
+        boot, sequence: Boot id and number of the snapshot that the page showed.
+        uuid: Uuid of the command, None for a new one.
+        vouched: Names of arguments that come from an administrator's table or the lab's records instead of the user.
 
     Raises:
         NotAllowed: The user lacks the role.
@@ -259,7 +266,10 @@ def _send(row: Command, command: messages.Command) -> Command:
 
 
 def _require_sendable(command: messages.Command) -> None:
-    """Raise EvaError if the command cannot be encoded, before its row exists and is resolved for an hour."""
+    """Raise EvaError if the command cannot be encoded.
+
+    To be called before its row is written: the outcome of a row without an answer is queried for an hour.
+    """
     try:
         messages.encode(command)
     except CodecError as error:
@@ -321,9 +331,10 @@ def _merged(row: Command) -> Command:
 
 
 def _merged_fields(row: Command, first: Command) -> list[str]:
-    """Return the fields in which this record of a stop is better than the first, which arrived on another path.
+    """Return the names of fields that `row`, a record of a stop, can add to `first`, which arrived on another path.
 
-    These are the answer, if it was lost or not carried out there, and the user, if unknown there.
+    They are those of the answer, if `first` has none, or none by which the stop was carried out, and those of the user,
+    if `first` has no user.
     """
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"

@@ -42,7 +42,7 @@ class Shown(NamedTuple):
 def code_make(*, user: Any, station: Station) -> Shown:
     """Create an enrolment code for this station and invalidate earlier ones.
 
-    Raises: NotAllowed unless an administrator; EvaError without a gate.
+    Raises: NotAllowed unless the user is an administrator; EvaError if the lab has no gate.
     """
     require_role(user, Role.ADMIN)
     if settings.EVA_GATE is None:

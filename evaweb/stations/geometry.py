@@ -65,7 +65,7 @@ def _shape(visual: Visual) -> dict[str, Any]:
 
 
 def _frames(drawn: DrawnRobot) -> list[dict[str, Any]]:
-    """Return the end effector of every arm, and each reference frame of its poses once."""
+    """Return the frames of all end effectors, then the reference frames of their poses, without duplicates."""
     robot = drawn.robot
     frames: dict[int | None, dict[str, Any]] = {}
     for arm in robot.arms:

@@ -94,7 +94,7 @@ def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, An
 def _reason(text: object, sentence: object, visibility: Visibility, covered: str) -> str:
     """Return the reason for the station's state as it may be shown, else `covered`.
 
-    `said` holds the id and the arguments of the reason as a sentence.
+    `text` is the reason, and `sentence` has its id and arguments, or is None.
     """
     return visibility.redact_text(
         _sentence({"text": str(text or ""), **(sentence if isinstance(sentence, Mapping) else {})}), covered
@@ -135,9 +135,10 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
 def redact_events(
     rows: Iterable[Mapping[str, Any]], sight: Visibility, last: int = 0
 ) -> list[dict[str, Any]]:
-    """Return the events that reveal no policy, without the times and the number of the hidden ones.
+    """Return the events that reveal no policy.
 
-    Events are renumbered by their times [us], increasing from `last`: gaps would reveal how many are hidden.
+    They are renumbered by their times [us], increasing from `last`, so that neither the number nor the times of hidden
+    events can be inferred from gaps.
     """
     events = []
     for row in rows:

@@ -99,7 +99,10 @@ def _compiled(links: Future[LinkPoses]) -> None:
 
 
 def tip_of(arm: robots.Group) -> NDArray[np.float64]:
-    """Return the frame [4, 4] between the fingertips in the arm's end effector; identity without a gripper."""
+    """Return the pose [4, 4] of the point between the fingertips in the frame of the arm's end effector.
+
+    It is the identity without a gripper.
+    """
     return np.eye(4) if arm.tip is None else arm.tip
 
 

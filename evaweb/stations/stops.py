@@ -80,7 +80,7 @@ _stops: RequestCoalescer[Answer] = RequestCoalescer("stop", _MOST_STOPS)
 def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
     """Press the e-stop of a station and return the future of the answer.
 
-    During another press the answer is that press's, but this press is sent nevertheless.
+    If another press is in progress, the future has the answer to that press; this press is sent nevertheless.
     """
     work = partial(send_estop, station=station, username=username, why=why, uuid=uuid)
     return _presses.submit(station, work, identity=str(uuid), shared=True)

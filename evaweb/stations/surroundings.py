@@ -103,7 +103,10 @@ def _floor(drawn: DrawnRobot, home: Sequence[Box]) -> float | None:
 
 
 def _table(drawn: DrawnRobot, home: Sequence[Box]) -> Rectangle:
-    """Return the table's x from, to, y from, to [m]: large enough for bases on it, clear of a body next to it."""
+    """Return the table as (x from, x to, y from, y to) [m].
+
+    It is large enough for all bases that are on it, and is cut clear of a robot's body that reaches below it.
+    """
     x_from, x_to, y_from, y_to = _LEAST_TABLE
     for x, y, z in _roots(drawn):
         if z > _BELOW:

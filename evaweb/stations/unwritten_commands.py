@@ -80,7 +80,7 @@ class UnwrittenCommands:
         self.start_writing()
 
     def start_writing(self) -> None:
-        """Wake the writer thread, starting it if needed; it also handles files of ended processes."""
+        """Wake the writer thread, starting it if needed; it also writes the commands that ended processes left."""
         with self._starting:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="unwritten", daemon=True)

@@ -1,8 +1,9 @@
 """Means of bounded outcomes, with intervals that are valid for small samples of any distribution.
 
-Formula: Gaffke (2005), two-sided. The weights of the outcomes are drawn as gaps between uniform numbers; one extra gap
-is given to the least possible value for the lower end, and to the largest for the upper end. For outcomes of 0 and 1
-the ends are those of Clopper and Pearson.
+Formula: Gaffke (2005), two-sided. In each draw the outcomes get random weights, which are the gaps between sorted
+uniform numbers. There is one more gap than outcomes: its weight goes to the least possible value for the lower end of
+the interval, to the largest possible value for the upper end. For outcomes of 0 and 1 the ends are those of Clopper and
+Pearson.
 """
 
 from __future__ import annotations

@@ -65,8 +65,8 @@ def _lower_bound(differences: Sequence[float], alpha: float) -> float:
 def _max_log_wealth(shares: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
     """Return the largest log wealth that the gamblers together had after any pair.
 
-    `shares` [levels] are the outcome levels divided by the mean, both counted from -1; `counts` [pairs, levels] is the
-    cumulative count of each level.
+    `shares` [levels] has (1 + level) / (1 + tested mean) for each distinct difference `level`; `counts` [pairs, levels]
+    is the number of pairs with each level so far.
     """
     import numpy as np
 

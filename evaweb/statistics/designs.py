@@ -31,20 +31,20 @@ class Design:
     """Frozen design of a plan's comparisons.
 
     Attributes:
-        rule: "none": fixed number of blocks with one test at the end; "evidence": e-process after every pair;
-            "late", "early": exact `boundary` at its looks.
+        rule: "none": fixed number of blocks with one test at the end; "evidence": e-process after every pair; "late",
+            "early": exact `boundary` at its looks.
         blocks: Number of blocks at most.
         alpha: Error probability of all comparisons together.
-        margin: None: the question is whether two arms differ. Otherwise: whether the first arm's success rate is
-            lower than the second's by less than this.
+        margin: If None, the question is whether two arms differ. Otherwise it is whether the first arm's success rate
+            is lower than the second's by less than the margin.
         outcome: "success" or "score".
         boundary: Boundary of each comparison, if the rule has one.
         comparisons: Pairs of arms, each tested at its share of `alpha`.
-        drops: Whether an arm is no longer tried once a comparison found it worse, or all its comparisons have
-            ended.
+        drops: Whether an arm is no longer tried once a comparison found it worse, or all its comparisons have ended.
         counts: Trials of both arms after each block [blocks, 2]; None if every block has one of each.
-        holm: With one test at the end: the comparison with the smallest p is decided at its share of alpha, each
-            next one at its share among the remaining ones, up to the first that is not significant.
+        holm: Whether comparisons with one test at the end are decided by Holm's procedure: in ascending order of p,
+            each at `alpha` divided by the number of comparisons not decided yet, up to the first that is not
+            significant.
     """
 
     rule: str
@@ -437,7 +437,7 @@ def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tupl
 
 
 def of_so_many(found: Design, blocks: int) -> Design:
-    """Return the design of one comparison for `blocks` pairs instead; looks beyond them are omitted."""
+    """Return the design `found` of one comparison, but planned for `blocks` blocks; looks beyond them are omitted."""
     schedule = look_schedule(found) if found.rule in SHAPES else []
     shortened = design(
         rule=found.rule,

@@ -52,7 +52,10 @@ class Scores:
             raise StatisticsError(f"{self.points} points; allowed: 1 to {LARGEST}")
 
     def spreads(self) -> tuple[float, float]:
-        """Return the standard deviations of both: the feasible value nearest to the assumed one, given the mean."""
+        """Return the standard deviation of each checkpoint's scores.
+
+        It is the assumed one, or the nearest that is possible for the checkpoint's mean and the number of points.
+        """
         first, second = (self._spread(mean) for mean in (self.first, self.second))
         return first, second
 

@@ -42,7 +42,10 @@ class Evidence:
 
     @property
     def p(self) -> float:
-        """Two-sided probability: twice the smaller of both, at most 1; 1 before the first pair."""
+        """Two-sided probability: twice the smaller of the last `p_first` and `p_second`, but at most 1.
+
+        1 before the first pair.
+        """
         return min(1.0, 2 * min(self.p_first[-1], self.p_second[-1])) if self.pairs else 1.0
 
 

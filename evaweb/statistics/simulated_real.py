@@ -46,8 +46,8 @@ def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float
 def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
     """Return the mean rank violation over the checkpoints.
 
-    That of a checkpoint is its largest real difference to a checkpoint with which simulation has it in a different
-    order.
+    The violation of a checkpoint is the largest difference of real values between it and any checkpoint with which it
+    has another order in simulation; 0 without such a checkpoint.
     """
     _check(simulated, real)
     numbers = range(len(real))
@@ -100,8 +100,9 @@ def _powered(arm: Powered) -> tuple[float, float]:
 
 
 def _covariance(first: Sequence[float], second: Sequence[float]) -> float:
-    """Return the sum of the products of both deviations from their means, which is not divided by the number of
-    values.
+    """Return the sum over all pairs of the product of both values' deviations from their means.
+
+    It is not divided by the number of pairs.
     """
     mean_first, mean_second = math.fsum(first) / len(first), math.fsum(second) / len(second)
     return math.fsum((a - mean_first) * (b - mean_second) for a, b in zip(first, second, strict=True))

@@ -1,11 +1,11 @@
 """Median-unbiased estimate of the difference of two arms for a design that may stop early.
 
 A design that stops when the difference is large overestimates it. Outcomes are therefore ordered by the stage at which
-they occur (Armitage 1957; Tsiatis, Rosner and Mehta 1984): an early stop for the first arm ranks highest, an early
-stop for the second lowest; at the end, and among tables of one look, the larger difference ranks higher. The estimate
-is the difference of rates under which the observed outcome is the median of that order; at the interval's ends the
-probability of an outcome at least as far out is (1 - level) / 2. For each difference the other rate is the most likely
-one.
+they occur (Armitage 1957; Tsiatis, Rosner and Mehta 1984): an early stop for the first arm ranks highest, an early stop
+for the second lowest; at the end, and among tables of one look, the larger difference ranks higher. The estimate is the
+difference of rates under which the observed outcome is the median of that order; at the interval's ends the probability
+of an outcome at least as far out is (1 - level) / 2. Of all pairs of rates with a given difference, the most likely
+pair is used.
 """
 
 from __future__ import annotations

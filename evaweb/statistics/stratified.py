@@ -127,9 +127,9 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
 
 
 def _fillings(tables: Sequence[dict[int, int]], left: int) -> Iterator[int]:
-    """Yield a number of combinations for each choice of successes of the first arm in every stratum.
+    """Yield the number of combinations of each way to distribute `left` successes of the first arm over the strata.
 
-    Only choices whose sum is `left` are considered.
+    `tables` has for each stratum the number of combinations by the first arm's number of successes.
     """
     first, *further = tables
     if not further:

@@ -77,7 +77,7 @@ def trial_failure(
 
 
 def _reworded(user: User, trial: Trial, verdict: Score, texts: Mapping[str, str], reason: str) -> Score:
-    """Add a copy of the score `seen` with other words for the failure.
+    """Add a copy of the score `verdict` with the failure phase and cause in `texts`.
 
     Its milestones are copied too, even if the scene's milestones have changed since.
     """

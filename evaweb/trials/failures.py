@@ -100,11 +100,11 @@ def check_failure(
     by_person: bool = True,
     said: Mapping[str, str] | None = None,
 ) -> None:
-    """Raise EvaError if a score must not have these `words` (by field).
+    """Raise EvaError if a score must not have these `words` (failure phase and cause, by field).
 
-    `said` are the words of the previous score, which may stay. A phase must be one of the lab's. A cause must be one
-    too if it is given with a phase, or if the scene requires both from human raters; a cause alone may be any text, as
-    programs send it.
+    A success must have neither. A phase must be a term of the lab. A cause must be a term of the lab if a phase is
+    given with it, or if the scene requires both from human raters; a cause alone may be any text, because programs send
+    such texts. `said` are the words of the previous score, which are also accepted if they are no terms any more.
     """
     for field in FIELDS if success else ():
         if words[field]:

@@ -114,7 +114,7 @@ def failure_groups(filters: FailureFilters, sight: Visibility) -> list[Group]:
 def failures_of(keys: Sequence[int], filters: FailureFilters, sight: Visibility) -> list[Trial]:
     """Return the trials with these ids, in the order of `failed_list`, with related rows loaded.
 
-    A caller with very many trials can so sort the ids alone and load the rows in parts.
+    For very many trials a caller can sort the ids alone, and then load the rows in parts with this function.
     """
     rows = failed_list(filters, sight).filter(pk__in=keys).select_related("episode", *NAMED)
     return list(rows.prefetch_related("verdict__outcomes"))

@@ -21,7 +21,7 @@ def station(facts: TrialRecord) -> Station:
 def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
     """Return the trial's evaluation.
 
-    The station's open bench has one row for all versions; its version is raised to the trial's.
+    A station's open bench is one row with a version number; the number is raised to that of the trial if it is lower.
     """
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         row, _ = Evaluation.objects.get_or_create(

@@ -244,7 +244,7 @@ def _write_milestones(scene: Scene, tables: Sequence[MilestoneTable]) -> list[Fa
 def _make_room(scene: Scene, n: int) -> None:
     """Move all milestones of the scene to places above the first `n`, so that these are free.
 
-    The order so stays unique while the milestones are then moved to their new places one by one.
+    The places stay unique while the milestones are then moved to their new ones one by one.
     """
     used = set(scene.milestones.values_list("order", flat=True))
     free = (place for place in count(n + 1) if place not in used)
@@ -261,7 +261,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _strangers(tables: Sequence[Any], rows: Mapping[int, Any], kind: str) -> list[Fault]:
-    """Return a fault for each id in `wanted` that is not a row of this scene, or occurs twice."""
+    """Return a fault for each id in `tables` that is not a key of `rows` (the scene's own), or that occurs twice."""
     ids = [table.id for table in tables if table.id is not None]
     wrong = [id for id in ids if id not in rows or ids.count(id) > 1]
     return [

@@ -292,10 +292,11 @@ _known: FingerprintCache[_Known] = FingerprintCache()
 
 
 def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
-    """Return the summaries of the scored trials among `trials`, whose query uses only their own columns.
+    """Return the summaries of the scored trials among `trials`, by scene and checkpoint.
 
-    Every change to data in a summary also saves its trial or marks it as changed. The cache key is the query with the
-    ids of named rows: a name may come to denote another row.
+    `trials` may be filtered by columns of trials only, because changes are found by them: every change to data in a
+    summary also saves its trial or marks it as changed. The cache key is the query with the ids of named rows, because
+    a name may come to denote another row.
     """
     return _known.renew(str(trials.query), lambda before: _brought_up(before, trials)).cells
 
@@ -330,9 +331,9 @@ def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
 
 
 def _same(before: Collection[_Row], rows: Collection[_Row]) -> bool:
-    """Return True if all trials in `before` are still in `seen`, with the same scene and checkpoint.
+    """Return True if all trials in `before` are still in `rows`, with the same scene and checkpoint.
 
-    Otherwise the database was lost or its clock was set back.
+    If not, the database was lost or its clock was set back, and cached summaries cannot be updated.
     """
     return {(pk, scene, checkpoint) for pk, _, scene, checkpoint in before} <= {
         (pk, scene, checkpoint) for pk, _, scene, checkpoint in rows

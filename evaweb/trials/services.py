@@ -153,15 +153,15 @@ def register_settled(told: Callable[[Trial, Any], None]) -> None:
 
 
 def declare_failing(rule: Callable[[Trial], str]) -> None:
-    """Register a rule that returns the reason for which a trial is a failure by itself, "" if it is not.
+    """Register a rule by which certain trials are failures whatever milestones were reached.
 
-    Such a trial is a failure whatever milestones were reached.
+    The rule returns the reason for a trial, "" if the trial is not such a failure.
     """
     _failing.append(rule)
 
 
 def failing(trial: Trial) -> str:
-    """Return the reason for which the trial is a failure by itself; "" if its milestones decide."""
+    """Return why the trial is a failure whatever milestones were reached; "" if its milestones decide."""
     return next((reason for rule in _failing if (reason := rule(trial))), "")
 
 
@@ -185,7 +185,8 @@ def prepare_trial(
 ) -> Trial:
     """Prepare the next trial of this checkpoint at this position, in the station's open bench.
 
-    It is a new attempt of the lowest number whose newest attempt does not count; if there is none, the next number.
+    Trials are numbered, and each number may have several attempts. The trial is a new attempt of the lowest number
+    whose newest attempt does not count; if there is no such number, it is the first attempt of the next number.
     Raises: Conflict, with advice, if the station has an unfinished trial.
     """
     require_role(user, Role.OPERATOR)
@@ -265,7 +266,9 @@ def create_trial(
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
 ) -> Trial:
-    """Create exactly this trial, prepared; call within a transaction, after finding that it is the next one.
+    """Create a prepared trial with exactly this number and attempt.
+
+    The caller has found out, in the same transaction, that this number and attempt are the next.
 
     Raises:
         Conflict: The station has an unfinished trial; the message has advice.
@@ -454,7 +457,7 @@ def _reject_repeat(trial: Trial, values: Mapping[str, Any], outcome: ScoredOutco
 
 
 def _require_truth(trial: Trial, outcome: ScoredOutcome) -> None:
-    """Raise EvaError unless the bench's ground truth agrees with the score, which is recorded as given by the bench."""
+    """Raise EvaError unless the bench's ground truth agrees with a score whose source is declared as that truth."""
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
     for milestone, reached, _ in outcome.reached:

@@ -261,7 +261,10 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
 
 
 def _require_same(first: Command, trial: Trial, same: bool) -> None:
-    """Raise Conflict unless the command that already has this uuid is the `same` command for this trial."""
+    """Raise Conflict unless `same` is True.
+
+    `first` is the earlier command with the uuid of a new one; `same` is whether it is the same command for this trial.
+    """
     if not same:
         raise Conflict(_UUID_OF_ANOTHER(uuid=first.pk, first=first, trial=trial.pk))
 

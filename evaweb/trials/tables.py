@@ -74,10 +74,10 @@ def check_milestones(texts: Sequence[str]) -> None:
 
 
 def check_bench(given: object) -> None:
-    """Raise ValidationError unless `given` is a layout: "block": [x, y, yaw], "plate": [x, y].
+    """Raise ValidationError unless `given` is None or the layout of a bench.
 
-    These two are for simulated benches. "objects" are for benches laid out by people: name -> [x, y, yaw, width,
-    depth]; lengths in metres, yaw in degrees.
+    "block": [x, y, yaw] and "plate": [x, y] are for simulated benches. "objects" are for benches laid out by people:
+    name -> [x, y, yaw, width, depth]. Lengths are in metres, yaw in degrees.
     """
     if given is None:
         return
@@ -130,7 +130,7 @@ def _is_number(value: object) -> bool:
 
 
 def _problems(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
-    """Return the errors of `value` as a table of this kind.
+    """Return the errors of `value` as a table of the kind that `config` models.
 
     Missing keys are no errors: they come from the deployment.
     """
@@ -144,9 +144,10 @@ def _problems(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
 
 
 def _matching_keys(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
-    """Return how many keys of `value` resemble keys of this kind of table, and the number of the kind's keys.
+    """Return how well `value` fits the kind of table that `config` models, as a pair for sorting.
 
-    The second number breaks ties.
+    It has the number of keys of `value` that resemble a key of that kind and, to break ties, the number of that kind's
+    keys.
     """
     near = [key for key in value if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)

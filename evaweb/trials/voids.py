@@ -1,8 +1,8 @@
 """Voiding of trials; in a blind plan, a scored trial needs two operators.
 
-An operator who knows a trial's score could select by it. So the first operator requests the void, the trial is repeated
-meanwhile, and a second, equally blind operator agrees or refuses. A request that is not answered in time lapses: the
-trial counts again, and its repetition does not.
+An operator who knows the score of a trial could void it because of that score, and so bias the result. Therefore the
+first operator requests the void, the trial is repeated meanwhile, and a second, equally blind operator agrees or
+refuses. A request that is not answered in time lapses: the trial counts again, and its repetition does not.
 """
 
 from __future__ import annotations

@@ -29,10 +29,10 @@ from evaweb.statistics.multiple_comparisons import holm, letters
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Training runs of one recipe: the success rate of each, and their mean with an interval over runs instead of
-    trials.
+    """Training recipe with several training runs: the success rate of each run, and their mean.
 
-    With fewer than three runs there is no interval: it has to cover what another training run would achieve.
+    The mean's interval treats the runs as the sample, not their trials, because it has to cover what another training
+    run would achieve. With fewer than three runs there is no interval.
     """
 
     name: str
@@ -102,19 +102,19 @@ def analyse(
 
     Args:
         outcomes: Trials that count.
-        interruptions: Interrupted runs; they only count for the rate of interventions.
+        interruptions: Interrupted runs; they are used only for the rate of interventions.
         alpha: Error probability of all comparisons together.
-        planned: Verdicts by planned comparison, in its direction; in unplanned ones the better checkpoint is
-            first.
-        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there
-            are no pairs.
-        limits: Time limits [s] of the scenes that have one. The smallest is the horizon of times to success;
-            without any, the longest run.
-        checkpoints: All checkpoints of the evaluation in the order of their colours, whichever were selected.
-        whole: Whether these are all trials of a plan, with blocks numbered from 0. Evidence then ends before the
-            first incomplete block, as in the plan's design: otherwise the choice of the next trial could
-            influence it.
-        recipes: Recipe of each checkpoint that is one of its training runs.
+        planned: The design's verdict on each planned comparison (first, second). Planned comparisons keep this order;
+            in any other the checkpoint with the higher success rate is the first.
+        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there are no
+            pairs.
+        limits: Time limits [s] of the scenes that have one. The smallest is the horizon of times to success; without
+            any limit the horizon is the duration of the longest run.
+        checkpoints: All checkpoints of the evaluation in the order of their colours, including those without a trial in
+            `outcomes`.
+        whole: Whether these are all trials of a plan, with blocks numbered from 0. Evidence then ends before the first
+            incomplete block, as in the plan's design: otherwise the choice of the next trial could influence it.
+        recipes: Name of the training recipe by checkpoint, for the checkpoints that are training runs of one.
     """
     by_design = planned or {}
     arms, timing = by_checkpoint(outcomes), TimeHorizon.of(outcomes, limits or {})

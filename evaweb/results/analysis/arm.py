@@ -44,10 +44,10 @@ class Funnel:
 
 @dataclass(frozen=True, slots=True)
 class FailureMode:
-    """Phase and cause of failure ("" if unspecified) of `count` out of `n` trials, with the exact interval of the
-    share.
+    """Phase and cause of failure ("" if unspecified) of `count` out of `n` trials.
 
-    The interval is valid for a single mode named beforehand; for the most frequent of many it is too optimistic.
+    `interval` is the exact interval of the share `count` / `n`. It is valid for a single mode that was named
+    beforehand; for the most frequent of many modes it is too optimistic.
     """
 
     phase: str
@@ -142,7 +142,10 @@ def _write_funnels(funnels: Sequence[Funnel]) -> dict[str, Any]:
 
 
 def _write_times(arm: Arm) -> dict[str, Any]:
-    """Return the curve as points [time, share of successes, low, high], and the mean."""
+    """Return the time to success as JSON: counts, median, curve and restricted mean; null if it is unknown.
+
+    The points of the curve are [time in s, share of successes, lower end, upper end].
+    """
     curve, mean = arm.curve, arm.mean_time
     if curve is None or mean is None:
         return {"time_to_success": None}

@@ -41,7 +41,7 @@ _pages: FingerprintCache[dict[str, Any]] = FingerprintCache()
 
 
 def fingerprint(plan: Plan) -> Hashable:
-    """Return a value that changes whenever an analysis of the plan would."""
+    """Return a value that changes with every change of the data from which the plan is analysed."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     counted: dict[str, Any] = trials.aggregate(
         n=Count("pk"),
@@ -68,7 +68,10 @@ def cached_runs(plan: Plan, at: Hashable = None) -> Runs:
 
 
 def corrected_of(plan: Plan, only: TrialFilter, at: Hashable = None) -> dict[str, Proportion]:
-    """Return the current successes by checkpoint, for checkpoints with scores corrected since the reveal; else {}."""
+    """Return, by name, the current successes of each checkpoint with scores corrected since the reveal.
+
+    Only trials that the filter `only` selects count. {} for a plan that is not revealed.
+    """
     if not plan.at_reveal:
         return {}
     at = at or fingerprint(plan)

@@ -50,7 +50,10 @@ STRATA: dict[str, Callable[[Outcome], str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """Exact test within `strata` strata in which both checkpoints were tried."""
+    """Result of an exact test that is stratified, for example by scene: p-value `p`, and number of strata used.
+
+    A stratum is used if both checkpoints were tried in it.
+    """
 
     p: float
     strata: int
@@ -60,9 +63,11 @@ class Within:
 class Verdict:
     """Result of a planned comparison by its design.
 
-    `ended`: whether the design has reached its end. `apart`: whether it separated the two checkpoints; None if it has
-    not ended, or if it does not test whether they differ (non-inferiority). `evidence`: the outcome ("success",
-    "score") whose e-process is the design, "" for any other design.
+    Attributes:
+        ended: Whether the design has reached its end.
+        apart: Whether it separated the two checkpoints; None if it has not ended, or if it does not test whether they
+            differ (non-inferiority).
+        evidence: If the design is a test by e-values, the outcome that it tests ("success" or "score"); else "".
     """
 
     ended: bool = False
@@ -80,9 +85,9 @@ class Standing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AnswerContext:
-    """Context on which answers depend.
+    """Facts about the whole analysis that change how the answers of a comparison are worded.
 
-    `fixed`: the number of trials was fixed beforehand; `several`: there are several comparisons.
+    `fixed`: the number of trials was fixed beforehand. `several`: the analysis has several comparisons.
     """
 
     fixed: bool
@@ -94,8 +99,12 @@ class ComparedTrials:
     """Trials of two checkpoints, from which the statistics of their comparison are computed.
 
     Attributes:
-        test: Barnard's test, `corrected` by Holm's procedure.
+        first: Trials of the first checkpoint.
+        second: Trials of the second checkpoint.
+        test: Barnard's test of their success rates.
+        corrected: p-value of `test` after Holm's correction.
         alpha: This comparison's share of alpha.
+        timing: Horizon of times to success.
         in_pairs: False for checkpoints in random order.
         whole: Whether these are all trials of a plan.
     """
@@ -403,9 +412,10 @@ def compare(names: tuple[str, str], trials: ComparedTrials, verdict: Verdict | N
 
 
 def _described(comparison: Comparison, evidence: str) -> Comparison:
-    """Return an open comparison with its descriptions only: statistics that infer are emptied.
+    """Return an open comparison without its tests, evidence and letters: those fields become None or {}.
 
-    The statistic of `evidence`, if that is the design, also remains.
+    Descriptive statistics remain. If the plan's design tests the outcome `evidence` by e-values, that statistic remains
+    too.
     """
     left = (
         name

@@ -1,6 +1,7 @@
 """Conduct of an evaluation: everything in its record that may give a reader reason for doubt.
 
-All values are plain, and times are those of the database, so that pages, REST and reports show the same.
+Values are numbers and texts without formatting, and times are those of the database, so that pages, REST and reports
+show the same.
 """
 
 from __future__ import annotations
@@ -85,9 +86,10 @@ class AttemptRecord:
 
 
 def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[BenchImage]) -> dict[str, Any]:
-    """Return the conduct of a plan; `runs` are all attempts, `looks` all camera checks of their bench.
+    """Return the conduct of a plan as a dict, with one entry for each subject of this module.
 
-    It takes one more query per earlier version of the plan.
+    `runs` are all attempts, `looks` all camera checks of the bench before them. One more query is made for each earlier
+    version of the plan.
     """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
@@ -113,9 +115,10 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Benc
 
 
 def looked_behind(plan: Plan) -> list[dict[str, Any]]:
-    """Return the recorded unblindings of the plan, its earlier versions and related plans.
+    """Return the recorded unblindings of the plan, its earlier versions and related plans, in order of time.
 
-    Those after the end of the plan are left out. `own`: it was this version; `before`: it preceded this plan's freeze.
+    Unblindings after the end of the plan are left out. In each row `own` is True if exactly this version was unblinded,
+    and `before` if the unblinding preceded the freeze of this plan.
     """
     of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(
         plan__in=overlapping_plans(plan)
@@ -131,7 +134,10 @@ def looked_behind(plan: Plan) -> list[dict[str, Any]]:
 
 
 def all_attempts(plan: Plan, looks: Iterable[BenchImage]) -> list[AttemptRecord]:
-    """Return every attempt in the order of allocation; one query."""
+    """Return every attempt in the order of allocation; one query.
+
+    Bench matches and overrides of the attempts are taken from `looks`, the camera checks of the bench.
+    """
     fields = (
         "number",
         "code",
@@ -182,7 +188,7 @@ class BenchImage:
 
 
 def bench_images(plan: Plan) -> list[BenchImage]:
-    """Return all looks at the bench in the order in which they were made; one query."""
+    """Return the camera checks of the bench before the plan's runs, in the order in which they were made; one query."""
     rows = Achieved.objects.filter(trial__handout__plan=plan).order_by("pk")
     place = ("trial__station__name", "trial__scene__name", "trial__position__number", "camera")
     return [
@@ -214,10 +220,10 @@ def _accepted(images: Iterable[BenchImage]) -> dict[int, tuple[float | None, str
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Return the trials that count by checkpoint, for each operator or each station; `name` selects which.
+    """Return how many trials that count each operator, or each station, made of each checkpoint.
 
-    `uneven` is the largest number of trials by which an operator or station differs from its proportional share of a
-    checkpoint's trials. Dropped checkpoints and random order alone do not increase it.
+    `name` is "operator" or "station". `uneven` is the largest number of trials by which one of them differs from a
+    proportional share of a checkpoint's trials. Dropped checkpoints and random order alone do not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -328,7 +334,10 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 
 
 def _amendments(plan: Plan) -> list[dict[str, Any]]:
-    """Return the earlier versions, newest first, preceded by the next version if there is one."""
+    """Return the amendments of the plan with their reasons, newest first.
+
+    They are those that led from the first version to this one, and the one that made the next version, if there is one.
+    """
     amendments, version = [], plan
     while version.amends is not None:
         amendments.append(
@@ -416,7 +425,7 @@ def _is_out_of_order(rows: Iterable[AttemptRecord]) -> bool:
 
 
 def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
-    """Return the codes of first attempts that came after a later slot at the same station."""
+    """Return the codes of first attempts that came after an attempt at a later slot at the same station."""
     reached: dict[str, int] = {}
     begun: set[int] = set()
     codes = []
@@ -429,7 +438,10 @@ def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
 
 
 def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
-    """Return the camera checks at the plan's stations during its trials, and trials without one."""
+    """Return the camera checks made at the plan's stations during its trials.
+
+    `unchecked` has the codes of the trials that no sufficiently recent check by the same operator preceded.
+    """
     handed = [run.handed_at for run in runs]
     if not handed:
         return {"checks": [], "unchecked": []}
@@ -458,7 +470,11 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
 
 
 def _bench(plan: Plan, runs: Iterable[AttemptRecord], images: Iterable[BenchImage]) -> dict[str, Any]:
-    """Return the match gate of the plan, trials below it, trials without a known match, and replaced references."""
+    """Return the plan's match gate, and the runs that did not demonstrably pass it.
+
+    `low` are runs with a match below the gate, `unmatched` runs without a known match, and `references` the cameras
+    whose reference image was replaced during the plan.
+    """
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []
     references: dict[tuple[str, str, int, str], set[int]] = defaultdict(set)
@@ -491,8 +507,9 @@ def _bench(plan: Plan, runs: Iterable[AttemptRecord], images: Iterable[BenchImag
 
 
 def _compared(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
-    """Return the delays of each checkpoint, with paired tests of the planned comparisons, Holm-corrected for
-    their number.
+    """Return the statistics of each checkpoint's delays, such as idle time and latency.
+
+    The checkpoints of planned comparisons are compared by paired tests with Holm's correction for the number of tests.
     """
     names = compared(plan.document or {})
     gaps = _idle_gaps(runs)

@@ -100,7 +100,7 @@ def _milestones(
 ) -> dict[int, list[tuple[str, bool]]]:
     """Return by score its milestones in order, each with whether it was reached.
 
-    The scores are those that count now; all scores of the trials if `earlier` is not empty.
+    If `earlier` is empty, only the current score of each trial is included; otherwise all its scores are.
     """
     counting = (
         MilestoneOutcome.objects.filter(score__trial__in=trials)

@@ -13,8 +13,9 @@ from evaweb.trials.failure_text import failure_text
 class Outcome:
     """Outcome of one trial that counts.
 
-    `order` is its position among the runs of its evaluation. `block` names initial condition and repetition: trials of
-    one block had the same one. `milestones` are those of its scene, in order. `duration` is in s.
+    `order` is its position among the runs of its evaluation. All trials of one `block` have the same initial condition
+    and repetition. `milestones` says of each milestone of the scene, in order, whether it was reached. `duration` is in
+    s.
     """
 
     trial: int
@@ -76,10 +77,10 @@ class Pair:
 
 
 def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
-    """Return the pairs of both checkpoints' trials by block: as scheduled for a plan, else in the order of completion.
+    """Return for each block with trials of both checkpoints the pair of these trials.
 
-    A block in which one of the checkpoints has no trial is skipped. Of several trials in one block only the last
-    counts.
+    Pairs are sorted by the schedule's block number if the trials are of a plan, else in the order of completion. Of
+    several trials of a checkpoint in one block only the last counts.
     """
     second_by_block = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
     first_by_block = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
@@ -97,8 +98,10 @@ def unbroken(pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def _place(pair: Pair) -> int:
-    """Return the pair's position: the block number from the schedule, which does not depend on which trial
-    finishes first.
+    """Return the sort key of a pair.
+
+    It is the block number of the schedule, which does not depend on which trial finishes first. Without a schedule it
+    is the position of the pair's later trial.
     """
     block = pair.first.block
     return int(block) if block.isdecimal() else max(pair.first.order, pair.second.order)
@@ -129,12 +132,12 @@ class TimeHorizon:
 
     @classmethod
     def of(cls, outcomes: Sequence[Outcome], limits: Mapping[str, float]) -> TimeHorizon:
-        """Return the smallest limit, or the longest run without one."""
+        """Return the horizon: the smallest of `limits`, or without limits the duration of the longest run."""
         longest = max((o.duration for o in outcomes if o.duration is not None), default=0.0)
         return cls(min(limits.values(), default=longest), limits)
 
     def known(self, outcome: Outcome) -> bool:
-        """Return True if the trial's duration is known."""
+        """Return True if the trial's duration is known and the horizon is not 0."""
         return outcome.duration is not None and self.until > 0
 
     def time(self, outcome: Outcome) -> float | None:

@@ -38,11 +38,18 @@ _GAINS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Input of the calculator: assumed rates of the weaker and the better checkpoint, alpha, power, time per trial
-    [s], resources.
+    """Input of the calculator.
 
-    `checkpoints` are compared as in a plan's `comparing`, on `stations` in parallel; `hours` is the time available at
-    each station.
+    Attributes:
+        rate: Assumed success rate of the weaker checkpoint.
+        better: Assumed success rate of the better checkpoint.
+        alpha: Error probability of all comparisons together.
+        power: Wanted power.
+        cycle_s: Time per trial [s].
+        checkpoints: Number of checkpoints.
+        comparing: Which of them are compared with each other, as in a plan.
+        stations: Number of stations that work in parallel.
+        hours: Available time at each station [h].
     """
 
     rate: float = 0.5
@@ -112,7 +119,7 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
 def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, Any]:
     """Return what each design needs for the input, what the available time can detect, and power by gain.
 
-    It is computed on behalf of `person`, who has a limited share of the computation.
+    It is computed on behalf of `person`: nobody may use more than a share of the computing time.
 
     Raises:
         Busy: If the share of `person` is used up.
@@ -145,10 +152,10 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
 
 
 def design_for_power(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
-    """Return a design by `rule` that reaches the power, with its trials and robot hours at most and on average.
+    """Return a design by `rule` that reaches the power, with its maximum and average trials and robot hours.
 
-    `found` is its power and number of pairs; if None, no such design exists and `pairs` is None. Averages are given
-    only if a single pair of checkpoints is compared (`alone`).
+    `found` is its power and number of pairs; if None, no such design exists and `pairs` is None. The averages are None
+    unless a single pair of checkpoints is compared (`alone`).
     """
     if found is None:
         return {"rule": rule, "pairs": None}

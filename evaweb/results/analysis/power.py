@@ -35,9 +35,14 @@ _KEPT = 64
 class PowerRequest:
     """Request for the power of a design with `pairs` pairs at assumed rates.
 
-    `alpha` is that of each comparison. `question` has rates, wanted power and times; its weaker rate is that of the
-    control. `alone`: the plan has a single comparison. With `scores` the scores are compared, and the rates are their
-    means.
+    Attributes:
+        rule: Selected kind of design.
+        alpha: Alpha of each comparison.
+        margin: Margin of non-inferiority, None without one.
+        looks: Numbers of pairs after which the selected design tests.
+        question: Assumed rates (the weaker one is the control's), wanted power, and times.
+        alone: Whether the plan has a single comparison.
+        scores: If given, scores are compared instead of successes, and the rates are their means.
     """
 
     rule: str
@@ -67,8 +72,9 @@ class PowerRequest:
         return sorted(numbers | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
 
     def at(self, rule: str, pairs: int) -> DesignPower:
-        """Return the power of a design with `pairs` pairs, whose looks are at the same shares of its trials as
-        requested.
+        """Return the power of a design by `rule` with `pairs` pairs.
+
+        The requested looks are scaled in proportion to the number of pairs.
         """
         if self.scores is not None:
             return _computed(score_course, rule, pairs, self.scores, self.alpha)
@@ -106,7 +112,8 @@ class Figures:
 def _computed(work: Callable[..., Any], *given: Any) -> Any:
     """Run `work(*given)` outside the web process and return its result.
 
-    All drafts together have one person's share of the computation, because they are computed one after the other.
+    Each person gets a share of the computing time. All drafts together use the share of one person, because they are
+    computed one after the other.
     """
     return computations.questions.compute("drafts", work, *given)
 

@@ -36,10 +36,10 @@ def simulated_plans(plan: Plan) -> list[Plan]:
 
 
 def compare_with_real(real: Plan, simulated: Plan) -> dict[str, Any]:
-    """Return rates of the shared checkpoints, agreement of their order, and differences that use the simulated trials
-    too.
+    """Return the rates of the checkpoints that both plans tried, and how well their rankings agree.
 
-    Trials are matched by checkpoint, scene and position, in order.
+    The planned differences are estimated again with the help of the simulated trials. Trials are matched by checkpoint,
+    scene and position, in order.
     """
     real_outcomes, simulated_outcomes = (
         by_checkpoint(cached_runs(plan).outcomes) for plan in (real, simulated)

@@ -44,9 +44,9 @@ _EXAMPLE = bytes(KEY_BYTES)  # fixed, so that the example stays the same; freezi
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Step of the page.
+    """Step of drafting a plan, as shown on the draft's page.
 
-    Unless it is `done`, `words` is what is missing, and `blocks` is whether that prevents a freeze.
+    If it is not `done`, `words` says what is missing, and `blocks` is True if the plan cannot be frozen until then.
     """
 
     name: str

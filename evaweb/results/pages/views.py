@@ -149,7 +149,7 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render how the trials were made, and the alternative headlines."""
+    """Render the record of how the trials were made, and what would be concluded without part of them."""
     plan = _get_plan(name, version)
     sealed = _sealed_page(request, plan)
     if sealed:

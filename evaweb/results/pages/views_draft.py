@@ -99,9 +99,10 @@ def _design(numbers: dict[str, str], assumed: Question) -> dict[str, Any]:
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render all steps of a draft.
+    """Render all steps of a draft; with POST save changed fields.
 
-    A POST saves the valid ones of the changed fields and is answered with the effects of the change.
+    Of the changed fields only valid ones are saved. The response to a POST updates the parts of the page that depend on
+    them.
     """
     plan = plan_get(name=name, version=version, user=request.user)
     if request.method == "POST":
@@ -174,9 +175,10 @@ def _was(request: HttpRequest) -> dict[str, Any]:
 
 
 def _shown(now: Values, last_shown: Values, faults: dict[str, str]) -> dict[str, Any]:
-    """Return the state of the shown page: its values, with which its next change is compared, and a digest.
+    """Return the state that the page keeps for its next request.
 
-    The digest of the saved values (`now`) is sent with a freeze.
+    The page returns `last_shown`, so that its changes can be distinguished from other people's, and, with a freeze, the
+    digest of the saved values (`now`).
     """
     return {"was": json.dumps(last_shown), "seen": digest_of(now), "faults": faults}
 

@@ -39,11 +39,14 @@ _kept: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 def headline_alternatives(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     """Return the headline as decided, then each alternative, as dicts; [] for a plan without a comparison.
 
-    Each has a description, the pairs left, the sentence, and whether the conclusion is the same. Trials are left out by
-    whole blocks. The remaining blocks are judged by the design's rule, each comparison on its own, as if it had been
-    planned for this many (at its step of Holm's procedure, if used); with checkpoints in random order by one test of
-    all. If the design has not ended, nothing is left out, because nothing was concluded. `matches` is the smallest
-    bench match by trial, if known.
+    Each dict has a description, the number of pairs left, the sentence, and whether the conclusion is the same.
+
+    Alternatives that omit trials, for example those of one operator, omit their whole blocks. Each comparison is then
+    decided by the design's rule as if it had been planned for the remaining blocks (at its step of Holm's procedure, if
+    used); with checkpoints in random order it is one test of all of them. Before the design has ended there are no such
+    alternatives, because nothing was concluded.
+
+    `matches` is the smallest bench match by trial, for trials with a known one.
     """
     frozen = frozen_design(plan.document) if plan.document else None
     if frozen is None:
@@ -169,9 +172,9 @@ _Left = list[tuple[Design, list[Block]]]  # by comparison: its own design, and t
 
 
 def _stepped(design: Design, left: _Left) -> _Left:
-    """Return the designs with their shares of alpha by Holm's procedure; unchanged if the plan does not use it.
+    """Return each design with the share of alpha that Holm's procedure gives it, and its blocks.
 
-    Comparisons without blocks count as steps too.
+    The result is `left` if the plan does not use the procedure. A comparison without blocks counts as a step too.
     """
     if not design.holm:
         return left

@@ -78,7 +78,8 @@ class CitedRow:
 class Citation:
     """Result of a plan for citing.
 
-    `kept` is the record of its reveal, or of the current state without a reveal; `digest` is "" without a reveal.
+    If the plan was revealed, `kept` is the record of its reveal, and `digest` the digest of that record. Otherwise
+    `kept` describes the current state, and `digest` is "".
     """
 
     plan: Plan
@@ -98,7 +99,7 @@ class Citation:
 
     @property
     def commitment(self) -> str:
-        """Commitment of the reveal; if the reveal did not record it, that of the plan."""
+        """Commitment as the reveal recorded it; if it is not recorded there, the commitment of the plan."""
         return str(self.kept.get("commitment") or self.plan.commitment)
 
     @property
@@ -109,7 +110,7 @@ class Citation:
 
     @property
     def revealed_by(self) -> str:
-        """Name of the account that revealed the plan, as it was then."""
+        """Name that the account which revealed the plan had at that time."""
         own = self.plan.revealed_by.get_username() if self.plan.revealed_by else ""
         return str(self.kept.get("by") or own)
 
@@ -127,7 +128,7 @@ class Citation:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        """Blocks that count."""
+        """Blocks of trials from which the conclusion is drawn."""
         return blocks_of_record(self.kept)
 
     @cached_property

@@ -22,7 +22,7 @@ from evaweb.results.presentation.plan_result import PlanResult
 class ComparisonFact:
     """Question that a comparison answers, with the method and the answer.
 
-    `own` marks the answer that is the interval of the plan's design.
+    `own` is True if the answer is the interval by which the plan's design itself estimates the difference.
     """
 
     question: str
@@ -54,7 +54,10 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
 
 
 def comparison_facts(result: PlanResult, found: Comparison) -> dict[str, Any]:
-    """Return the sentence, the facts and the notes of a comparison; a planned comparison's sentence is its design's."""
+    """Return the sentence, the facts and the notes of a comparison.
+
+    The sentence of a planned comparison is the conclusion of its design.
+    """
     plan, analysis = result.plan, result.analysis
     names = compared(plan.document or {})
     planned = result.headline if (found.first, found.second) in names else None
@@ -85,7 +88,8 @@ def _facts(result: PlanResult, comparison: Comparison, own: str) -> Iterator[Com
 def _own_interval(plan: Plan) -> str:
     """Return the name of the statistic that is the interval of the plan's design.
 
-    "" if the design has none there: the estimate of a boundary is shown below the headline.
+    Return "" if none of a comparison's statistics is: for a design with a boundary, the estimate is shown below the
+    headline instead.
     """
     by_score = (plan.document or {}).get("stopping", {}).get("outcome") == PrimaryOutcome.SCORE
     if plan.stopping == StoppingRule.EVIDENCE:
@@ -94,9 +98,9 @@ def _own_interval(plan: Plan) -> str:
 
 
 def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> str:
-    """Return what these trials could not have detected at the comparison's share of alpha.
+    """Return a sentence on the gain that these trials could not have detected, at the comparison's share of alpha.
 
-    Without `found` it is about all checkpoints, at the largest share.
+    Without `found` the sentence is about all checkpoints, at the largest share of alpha of any comparison.
     """
     arms = [arm for arm in analysis.arms if found is None or arm.checkpoint in (found.first, found.second)]
     n = min(arm.success.n for arm in arms)

@@ -46,7 +46,7 @@ _UNDECIDED = 6  # format from which too few trials are reported as undecided
 class Headline:
     """Headline: a sentence per planned comparison, how they were decided, and alternative headlines.
 
-    An alternative is "" if it would be from the same blocks.
+    An alternative is "" if it would be concluded from exactly the same outcomes as the headline.
 
     Attributes:
         corrected: Alternative with the scores as corrected after the reveal.
@@ -139,8 +139,9 @@ def rule_text(plan: Plan) -> str:
 
 
 def sentence_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """Return the design's conclusion from these blocks: the best checkpoint, if asked for, and one sentence
-    per comparison.
+    """Return the design's conclusion from these blocks: one sentence per comparison.
+
+    A sentence on the best checkpoint precedes them, if there is one (see `best_of`).
     """
     return ". ".join(filter(None, (best_of(plan, found, blocks), *sentences_of(plan, found, blocks))))
 
@@ -156,8 +157,9 @@ def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[st
 
 
 def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tuple[str, str], ...]:
-    """Return the letters of checkpoints that were all compared with each other, best first; () otherwise, or
-    if not ended.
+    """Return (name, letters) of each checkpoint, best first; two that share a letter were not separated.
+
+    () unless all checkpoints were compared with each other and every comparison has ended.
     """
     names = compared(plan.document or {})
     arms = arms_of(names)
@@ -181,7 +183,8 @@ def _ranks(design: Design, arms: Sequence[str], results: Findings) -> bool:
 def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
     """Return the sentence on the best of three or more checkpoints, or on those that no comparison found worse.
 
-    "" if it was not asked for or is not decided, or if a test of scores only shows that they differ.
+    Return "" unless all checkpoints were compared with each other and every comparison has ended. Return "" too for a
+    fixed number of trials compared by scores: that test only shows whether two checkpoints differ.
     """
     document = plan.document or {}
     arms, results = arms_of(compared(document)), findings(found, blocks)
@@ -253,9 +256,10 @@ def _sentence(
 
 
 def _could_separate(plan: Plan, design: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
-    """Return True if this many trials could have separated the pair.
+    """Return True if this many trials could have separated the pair at all.
 
-    That is so if they separate it when every trial of its first checkpoint succeeds and every other one fails.
+    That is checked with the most extreme outcomes: every trial of the pair's first checkpoint succeeds, and every other
+    trial fails.
     """
     if (plan.document or {}).get("format", 1) < _UNDECIDED:
         return True
@@ -307,7 +311,7 @@ def _estimates(plan: Plan, design: Design, blocks: Sequence[Block]) -> Iterator[
 class WorstCase:
     """Conclusion of a comparison with discarded, unscored attempts counted against its winner.
 
-    `same` is True if it still wins.
+    `same` is True if the winner still wins.
     """
 
     sentence: str
@@ -337,7 +341,10 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
 
 
 def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
-    """Return the current trials with the outcomes in `decided`; unchanged if `decided` is not from the same trials."""
+    """Return `now` with the outcomes in `decided` as those that count.
+
+    It is returned unchanged if `decided` is not from the same trials.
+    """
     if len(now.counted) != len(decided):
         return now
     outcomes: list[Block] = []

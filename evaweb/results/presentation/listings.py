@@ -85,8 +85,8 @@ def failure_tables(
 ) -> list[dict[str, Any]]:
     """Return for each checkpoint with failures a Pareto chart, and a table of causes by phase with sums.
 
-    `order` has the lab's terms by field; other terms follow, unspecified ones come last. `address` returns the list of
-    trials by checkpoint, failure_phase and failure, each optional.
+    `order` has the lab's terms by field; other terms follow, unspecified ones come last. `address` returns the address
+    of a list of trials; its arguments checkpoint, failure_phase and failure are optional.
     """
     return [_failure_table(arm, order, address) for arm in analysis.arms if arm.failures]
 

@@ -1,7 +1,7 @@
 """Second ratings, preferences and automatic judgements as lines of an episode's journal of scores.
 
-They are in DATA/scores/UUID.jsonl: ratings and judgements in that of their trial, preferences in that of the trial
-that was run second. These files are never served.
+Each episode has one such file, DATA/scores/UUID.jsonl. A rating or judgement is in the file of its trial's episode, a
+preference in that of the trial that was run second. These files are never served.
 """
 
 from __future__ import annotations

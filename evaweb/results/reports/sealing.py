@@ -42,7 +42,11 @@ def record_to_seal(plan: Plan) -> dict[str, Any]:
 
 
 def _measured(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the digest of each run's measurements; `later` are trials whose recording has not been analysed yet."""
+    """Return one digest of the measurements of all runs.
+
+    `later` lists the trials whose recording has not been analysed yet: measurements from recordings are left out for
+    them.
+    """
     later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
     values = [
         [

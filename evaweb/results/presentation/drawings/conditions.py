@@ -33,7 +33,7 @@ _CELL = 30
 def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing | None:
     """Draw x/n by initial condition (rows) and checkpoint (columns), darker for more successes.
 
-    `links` by checkpoint and condition lead to the trials.
+    `links` maps (checkpoint, condition) to the address of a list of these trials. Return None without trials.
     """
     conditions = sorted({name for arm in arms for name in arm.cells}, key=_natural)
     if not conditions or not arms:
@@ -77,7 +77,8 @@ def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Draw
 def draw_pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
     """Draw the failures of one checkpoint by phase and cause, most frequent first.
 
-    Bars are shares of all its trials, with intervals as lines. `links` by phase and cause lead to the trials.
+    Bars are shares of all its trials, with intervals as lines. `links` maps (phase, cause) to the address of a list of
+    these trials.
     """
     total, so_far = sum(mode.count for mode in arm.failures), 0
     width, row = 600.0, 34

@@ -46,9 +46,17 @@ def drawing(
     columns: Sequence[str],
     rows: Iterable[Sequence[object]],
 ) -> Drawing:
-    """Return a figure of `width` x `height` user units that shrinks with its page; `words` is its description.
+    """Return a figure that shrinks with its page.
 
-    `rows` of `columns` are the numbers from which it was drawn.
+    Args:
+        width: Width [user units].
+        height: Height [user units].
+        title: Title of the figure.
+        words: Description of the figure as text.
+        parts: Elements as markup.
+        kind: Style class.
+        columns: Names of the columns of `rows`.
+        rows: Numbers from which the figure was drawn; they are embedded as CSV.
     """
     name = f"drawing-{next(_numbers)}"
     inner = "".join(parts)
@@ -110,7 +118,7 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
 
 
 def counted(found: Proportion) -> tuple[object, ...]:
-    """Return the cells for a proportion in the columns PROPORTION."""
+    """Return the values of a proportion for the columns whose names are in PROPORTION."""
     interval = found.interval
     return (found.successes, found.n, found.rate, interval and interval.low, interval and interval.high)
 
@@ -141,7 +149,7 @@ def path(points: Sequence[tuple[float, float]]) -> str:
 
 
 def link(address: str, title: str, content: str) -> str:
-    """Return the content with a tooltip, as a link to `address`; "" makes it no link."""
+    """Return the content with a tooltip, as a link to `address`; without a link if `address` is ""."""
     inner = element("title", escape(title)) + content
     return element("a", inner, href=address) if address else element("g", inner)
 

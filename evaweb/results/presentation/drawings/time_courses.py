@@ -42,7 +42,7 @@ def draw_funnel(
     """Draw for each milestone one bar per checkpoint with its interval; `found` has (series, name, funnel) per
     checkpoint.
 
-    `links` by checkpoint and index of the milestone lead to the trials that did not reach it.
+    `links` maps (checkpoint, index of the milestone) to the address of a list of the trials that did not reach it.
     """
     found = sorted(found, key=lambda one: one[0])  # the order of every other legend
     steps = len(found[0][2].steps) if found else 0
@@ -230,7 +230,7 @@ def power(
 def _steps(
     times: Sequence[float], values: Sequence[float], start: float, end: float
 ) -> list[tuple[float, float]]:
-    """Return the points of a step curve from time 0 to `end` that begins at `start`."""
+    """Return the points of a step curve from time 0 to `end`; its value is `start` until the first of `times`."""
     points, before = [(0.0, start)], start
     for t, value in zip(times, values, strict=True):
         points += [(t, before), (t, value)]

@@ -1,6 +1,7 @@
 """Recomputes every number of this report and prints those that differ.
 
-Exit code: 0 if all agree, 1 if one differs, 2 if nothing contradicts but without a key rewriting cannot be excluded.
+Exit code: 0 if all agree, 1 if one differs. It is 2 if all agree, but the plan's key is not revealed: it can then not
+be excluded that the data were rewritten consistently.
 """
 
 from __future__ import annotations
@@ -203,9 +204,9 @@ def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> 
 
 
 def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, str]:
-    """Return the trial with the values of `score`.
+    """Return the trial with the values of `score`, or as ended but unscored if `score` is None.
 
-    Without a score it is not scored. Its cause of failure stays the current one if its success is unchanged.
+    The current cause of failure is kept unless `score` has a different success.
     """
     if score is None:
         return {**row, "status": "ended" if row["status"] == "scored" else row["status"]}

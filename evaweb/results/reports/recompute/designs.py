@@ -168,11 +168,10 @@ def _plain(cell: str) -> Any:
 
 
 def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return for each comparison its number of blocks, the block of its end, its winner, and p of a fixed number's
-    test.
+    """Return for each comparison its number of blocks, the block of its end, and its winner.
 
-    If checkpoints are dropped, comparisons are decided block by block: the first to end in the schedule's order decides
-    which checkpoints remain.
+    For a fixed number of trials it also has the p-value of the test. If checkpoints are dropped, comparisons are
+    decided block by block: the first to end in the schedule's order decides which checkpoints remain.
     """
     names, arms = comparisons_of(plan), arms_of(plan)
     sides = [(arms.index(first), arms.index(second)) for first, second in names]
@@ -245,7 +244,7 @@ def _side_mean(blocks: Sequence[Block], plan: Mapping[str, Any], arm: int) -> fl
 
 
 def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[int, int]) -> dict[str, Any]:
-    """Return the conclusion of one comparison; `winner` is 0 or 1."""
+    """Return the conclusion of one comparison; `winner` is 0 (first of `sides`), 1 (second) or None."""
     stopping = plan["stopping"]
     foreseen, alpha, margin = _foreseen(plan), share_of(plan), stopping.get("margin")
     complete = _complete_blocks(blocks, stopping.get("counts"), sides)
@@ -284,7 +283,11 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
 def _complete_blocks(
     blocks: Sequence[Block], counts: Sequence[Sequence[int]] | None, sides: tuple[int, int]
 ) -> list[tuple[list[float], list[float]]]:
-    """Return the outcomes of both sides by block, up to the first incomplete block."""
+    """Return by block the outcomes of both checkpoints in `sides`, ending before the first incomplete block.
+
+    `counts` has the number of trials of both checkpoints that the schedule has up to the end of each block; None if
+    each block has one trial of each.
+    """
     complete: list[tuple[list[float], list[float]]] = []
     before = [0, 0]
     for number, block in enumerate(blocks):
@@ -329,10 +332,11 @@ def share_of(plan: Mapping[str, Any]) -> float:
 
 
 def _bound(share: Sequence[float], alpha: float) -> float:
-    """Return an upper bound of the mean of `share` over binomial numbers of successes at any rate.
+    """Return an upper bound of the mean of `share` over binomial numbers of successes, valid at any rate.
 
-    With rate = sin(angle)^2, the angle of a probability changes by at most sqrt(trials) per radian. If this does not
-    keep an interval below alpha, it is bisected, down to the numerical resolution.
+    Rate and mean are both expressed as sin(angle)^2. The mean's angle then changes by at most sqrt(trials) per radian
+    of the rate's angle, which bounds it between grid points. An interval whose bound exceeds alpha is bisected, down to
+    the numerical resolution.
     """
     turn, allowed, end = math.sqrt(len(share) - 1), math.asin(math.sqrt(alpha)), 1e-7
 
@@ -360,9 +364,10 @@ def _foreseen(plan: Mapping[str, Any]) -> int:
 
 
 def _side(table: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
-    """Return the side (0 or 1) for which the boundary stops at this `look`; None if it does not stop.
+    """Return the side (0 or 1) for which the boundary stops at a look; None if it does not stop.
 
-    `first` and `second` are the successes of both sides.
+    `table` is the boundary's row of that look, `first` and `second` are the successes of the first and the second
+    checkpoint.
     """
     n, m, *least = table
     if margin is not None:  # with a margin it tests its second arm: the first checkpoint

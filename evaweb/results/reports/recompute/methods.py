@@ -331,7 +331,8 @@ def score_bets(differences: Sequence[float]) -> list[float]:
 def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
     """Return the interval of means that no bet has refuted after any pair, or None if it is empty.
 
-    The bets are those of `score_bets` on differences rescaled such that -1 is at -1 and the tested mean at 0.
+    The bets are those of `score_bets`. They are placed on the differences rescaled so that -1 stays -1 and the tested
+    mean becomes 0.
     """
 
     def refuted(values: Sequence[float]) -> float:

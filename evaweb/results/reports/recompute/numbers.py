@@ -47,7 +47,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Drawn:
-    """New draws for an interval: 2.5 % of `lower` are below its lower end, 2.5 % of `upper` above its upper end."""
+    """Newly drawn samples for checking an interval.
+
+    The lower end of the interval is the 2.5 % quantile of `lower`, its upper end the 97.5 % quantile of `upper`.
+    """
 
     lower: list[float]
     upper: list[float]
@@ -156,7 +159,10 @@ def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, A
 
 
 def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:
-    """Remove inference from an open comparison; only descriptions and the evidence that is its design remain."""
+    """Remove all tests and evidence from an open comparison, so that only descriptions remain.
+
+    If the design is a test by e-values (`stopping`), the evidence on its outcome remains too.
+    """
     own = {"success": "evidence", "score": "score_evidence"}[stopping.get("outcome") or "success"]
     for name in (
         *("barnard", "probability_better", "mcnemar", "scores", "over_scenes", "evidence"),
@@ -279,10 +285,10 @@ def _time(trials: Trials, timing: Timing) -> dict[str, Any]:
 
 
 def _drawn(strata: Sequence[Sequence[float]], low: float, high: float) -> Drawn:
-    """Return new draws of means over strata of outcomes from 0 to 1, scaled to [low, high].
+    """Return new draws of the mean over `strata` of outcomes from 0 to 1, scaled to [low, high].
 
-    The weights are gaps between uniform numbers; one extra gap is given to 0 for the lower end, to 1 for the upper
-    end.
+    In each draw the outcomes of a stratum get random weights, which are gaps between sorted uniform numbers. There is
+    one more gap than outcomes: its weight goes to the value 0 for the lower end, to 1 for the upper end.
     """
     chance, drawn = random.Random(1), Drawn([], [])
     counted = [list(Counter(values).items()) for values in strata]
@@ -408,7 +414,10 @@ def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
 
 
 def _tables(first: Trials, second: Trials, key: str) -> dict[str, tuple[int, int, int, int]]:
-    """Return successes and trials of both in each stratum in which both were tried."""
+    """Return (successes, trials, successes, trials) of both checkpoints for each stratum in which both were tried.
+
+    `key` names the field of a trial that is its stratum.
+    """
     first_groups, second_groups = ({getattr(t, key): [] for t in arm} for arm in (first, second))
     for arm, groups in ((first, first_groups), (second, second_groups)):
         for trial in arm:

@@ -96,7 +96,7 @@ def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
 
 
 def counts(units: Sequence[Sequence[Any]], names: Sequence[str]) -> list[list[int]]:
-    """Return for each block the number of trials of every named checkpoint up to its end."""
+    """Return for each block how many trials of each checkpoint in `names` are scheduled up to its end."""
     blocks = 1 + max(unit[1] for unit in units)
     return [[sum(u[2] == name for u in units if u[1] <= at) for name in names] for at in range(blocks)]
 
