@@ -42,7 +42,10 @@ Tilts = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nominal:
-    """Posture `joints` [n] of an arm with fingertips at `down`; the jaws open at the angle `across` to its bearing."""
+    """Joints `joints` [n] of an arm whose fingertips point down at the pose `down`.
+
+    `across` is the angle between the bearing of this pose and the direction in which the jaws open [rad].
+    """
 
     joints: Float64
     down: DownwardTip
@@ -159,10 +162,10 @@ class Postures:
     def _descent(
         self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[DownwardTip]
     ) -> Float64 | None:
-        """Return joints [stations, D] for the stations; None if one of them is not reached.
+        """Return joints [stations, D] for the poses `stations`; None if the arm does not reach one of them.
 
-        The search begins at the nominal posture, rotated about an upright shoulder. If this fails, or the shoulder is
-        not upright, it follows a path from the nominal posture to the first station.
+        If the first joint is upright, the search begins at the nominal posture, rotated about this joint. If this
+        fails, or the joint is not upright, the search follows a path from the nominal posture to the first pose.
         """
         start = opened(arm, q)
         start[arm.joint_dims] = nominal.joints
