@@ -56,10 +56,7 @@ class Coordinator(Components):
 
     @property
     def rests(self) -> bool:
-        """Whether nothing is in progress and there is no lease holder.
-
-        Then only messages need to wake the process.
-        """
+        """Whether nothing is in progress and nobody holds the lease, so that only messages need to wake the process."""
         return not (
             self.session.state.meaning.at_work
             or self.setup.active

@@ -50,10 +50,10 @@ Committed = Callable[[Observation], Conditioning | None]
 
 @dataclass(frozen=True, slots=True)
 class MissBound:
-    """Greatest permitted errors of solved poses.
+    """Greatest permitted errors of poses that inverse kinematics has solved.
 
-    These are the error of position [m] and of rotation [rad], and `jump`, the greatest lag of the joints behind a pose
-    [rad].
+    `position` [m] and `rotation` [rad] bound the errors of a pose; `jump` [rad] bounds how far the joints may lag
+    behind the pose.
     """
 
     position: float
