@@ -289,8 +289,10 @@ class _Assembly:
         return written(splits)
 
     def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
-        """Return the lines of the list of episodes, with the keys that only the sources' writers know, if they can be
-        written.
+        """Return the lines of the list of episodes.
+
+        They keep the keys of the sources' lines that the format does not define; a key whose values cannot be written
+        in this version is reported as left out.
         """
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]
@@ -625,8 +627,8 @@ def _folders(source: SourceDataset) -> set[str]:
 
 
 def _of_three(statistic: Statistic) -> Statistic:
-    """Return a statistic with the single channel's figures repeated three times: readers of v2.1 refuse other
-    numbers.
+    """Return a statistic of a single channel with its figures repeated for three channels, which readers of v2.1
+    require.
     """
     figures = (name for name in statistic if name != "count")
     return statistic | {name: (statistic[name] * 3)[:3] for name in figures}
