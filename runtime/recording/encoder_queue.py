@@ -23,10 +23,10 @@ class Picture(NamedTuple):
 
 
 def encode_count(repeats: int) -> int:
-    """Return the number of frames to code for `repeats` repeats in a row; the remaining frames are copies.
+    """Return how many of `repeats` successive repeats must be encoded; the remaining frames are copies of encoded ones.
 
-    A run of copies alternates between two key frames and ends with the second, so if the number is odd, one more repeat
-    is coded before it.
+    Copies alternate between two encoded key frames and come in pairs, so if the number is odd, one more repeat is
+    encoded before them.
     """
     return repeats if repeats < RUN else 2 + repeats % 2
 
