@@ -80,7 +80,10 @@ class PostureSearch:
         return best
 
     def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
-        """Return the posture after moving every joint back to home for which this adds no touching pair."""
+        """Return the posture with as many joints as possible moved back to their home values.
+
+        One joint after the other is moved, and stays there if not more than `fewest` links touch then.
+        """
         for dim in self._dims():
             tried = q.copy()
             tried[dim] = home[dim]
@@ -186,7 +189,11 @@ class PostureSearch:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """Return a cost for how deep links collide, or fingertips are too low, at the posture and on the path to it."""
+        """Return the cost of collisions, and of fingertips that are too low, at postures and on the straight path to
+        them.
+
+        It is proportional to the worst depth on the path.
+        """
         path = home + _LOOKED_AT[:, None, None] * (q - home)
         deep = np.maximum(2 * CLEAR - self._apart(path), 0.0) + np.maximum(
             _LOWEST - self._heights(path), 0.0
