@@ -187,7 +187,7 @@ class Gr00tServer:
         return self._action(message["data"])
 
     def _contract(self) -> dict[str, object]:
-        """Return the reply of a StarVLA server: state and action keys with prefix and number of dimensions, no images."""
+        """Return the reply of a StarVLA server: state and action keys with prefix and width, without images."""
         groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
         actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
         contract: dict[str, object] = {"unnorm_key": "stand_in"}
