@@ -285,7 +285,10 @@ class PickPlaceEpisode:
 
 
 def joints_apart(robot: Robot) -> Apart:
-    """Return a function that computes the largest distance [rad] to each row over the URDF's joints except grippers."""
+    """Return a function that computes for each row its largest joint difference from given joints [rad].
+
+    It compares the joints of the URDF except grippers.
+    """
     moving = np.concatenate([group.joint_dims[np.array(group.urdf_joints) != ""] for group in robot.groups])
 
     def apart(arm: Group, rows: Float64, q: Float64) -> Float64:

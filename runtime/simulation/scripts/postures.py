@@ -1,8 +1,9 @@
 """Joints of an arm for fingertips that point down above a block or a plate.
 
 Four points of every vertical path are solved by inverse kinematics. The solver starts from a nominal posture of the arm
-with its fingers down, which is searched once. The posture is rotated about the first joint if that is upright;
-otherwise it is moved from place to place.
+with its fingers down, which is searched once. If the first joint turns the arm about the vertical, the nominal posture
+is rotated about it towards the path. Otherwise, or if that fails, the solver follows a path from the nominal posture to
+the first point.
 """
 
 from __future__ import annotations
