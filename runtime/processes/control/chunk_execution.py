@@ -43,7 +43,7 @@ _ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person requests each ch
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """Merge half of a strategy, with its kind."""
+    """Part of a strategy that merges chunks into the plan, with the strategy's kind."""
 
     kind: str
     merge: Merge

@@ -387,7 +387,10 @@ class JointPlausibility:
 
 
 class TrustingPlausibility(JointPlausibility):
-    """Plausibility check that trusts every sample: if no robot moves, a replayed recording jumps when it restarts."""
+    """Plausibility check that trusts every sample.
+
+    It is used if no robot moves: the joints of a replayed recording jump when it starts again.
+    """
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         if seen.measured:

@@ -86,7 +86,14 @@ class HealthMonitor:
     ) -> None:
         """Begin to monitor.
 
-        `stoppable` returns whether a person at the robot can stop the run, because the station's panel is served.
+        Args:
+            spec: Specification of the station.
+            shared: Shared state of the station's processes.
+            lease: Lease to monitor.
+            clock: Clock of the runtime.
+            people: Clock of leases.
+            reception: Returns the latest report of reception.
+            stoppable: Returns True if a person at the robot can stop the run, because the station's panel is served.
         """
         self._plan = spec
         self._shared_state = shared

@@ -45,7 +45,7 @@ class FaultTimeouts:
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """Query half of a strategy, with its parameters."""
+    """Part of a strategy that decides when to query the policy, with the strategy's parameters."""
 
     query: Query
     parameters: StrategyParameters
