@@ -167,9 +167,10 @@ class DisplacementMonitor:
         )
 
     def reason(self, robot: RobotActuator, measured: Float64 | None) -> str:
-        """Return why no motion may begin from the commanded position, "" if it may.
+        """Return why no motion may begin from the commanded position: a joint is too far from it; "" if a motion may
+        begin.
 
-        `measured` [D] is None if unknown.
+        `measured` [D] is None if unknown; the result is then "".
         """
         if measured is None or not robot.engaged or not self._settings.checks_measurements:
             return ""
@@ -198,7 +199,9 @@ class DisplacementMonitor:
         )
 
     def converge_to_measured(self) -> None:
-        """Move the hold target to the measured joints, including untrusted ones: the operator has asked for it."""
+        """Move the hold target to all measured joints, because the operator has asked for it; all joints are trusted
+        again.
+        """
         self.trust_all_joints()
         self._meeting = True
 

@@ -86,7 +86,10 @@ DISARMING = frozenset(
 
 
 class Demonstrations:
-    """Demonstrations of a station; `armed` is a person's permission to begin the next one."""
+    """Demonstrations of a station.
+
+    `armed` is True if a person has permitted the next demonstration to begin.
+    """
 
     def __init__(
         self,
