@@ -550,8 +550,9 @@ class _Assembly:
 
 
 def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
-    """Return the lines by the index of their episode. Raises: RecordingError if two lines are about the same
-    episode.
+    """Return the lines by the index of their episode.
+
+    Raises: RecordingError if two lines are about the same episode.
     """
     by_index = {line["episode_index"]: line for line in lines}
     if len(by_index) < len(lines):
@@ -564,15 +565,19 @@ def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
 
 
 def _is_its_own(path: Path, root: Path) -> bool:
-    """Return True if `path` leads into the dataset, or into the cache in which a hub keeps a snapshot's files."""
+    """Return True if `path` is in the dataset, or in the cache to which a hub's snapshot links.
+
+    Links are resolved first.
+    """
     resolved = root.resolve()
     places = (resolved, resolved.parent.parent / "blobs")
     return any(path.resolve().is_relative_to(place) for place in places)
 
 
 def _changed(original: pa.Array, converted: pa.Array) -> str:
-    """Return a sentence on the first value that a cast to another type changed by more than float32 rounds; "" if
-    none.
+    """Return a sentence about the first value that the conversion to another type has changed noticeably, else "".
+
+    Changes by rounding to float32 are permitted.
     """
     before, after = (
         np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (original, converted)
