@@ -145,9 +145,9 @@ class Home:
         self._look_at = self._clock() + max(_LOOK_S, _LOOK_SHARE * (self._clock() - now))
 
     def _sort_in(self, name: str) -> None:
-        """Decide whether a new folder is an episode to send.
+        """Record a new folder as an episode to send, or as one of another station.
 
-        The recorder writes the outcome last: an episode without it is not closed.
+        A folder without an outcome is skipped until later: the recorder writes the outcome last.
         """
         try:
             closed = (self._root / name / OUTCOME).stat().st_mtime
