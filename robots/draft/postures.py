@@ -56,7 +56,10 @@ class PostureSearch:
         self._draw = np.random.default_rng(0)  # fixed seed: the same URDF gives the same draft
 
     def home(self) -> Float64:
-        """Return the home pose, or the nearest posture with the fewest touching links, mirrored for mirrored arms."""
+        """Return the home pose, or, if links touch in it, the nearest posture found with the fewest touching pairs.
+
+        Mirrored arms have mirrored postures.
+        """
         home = self._robot.poses["home"]
         dims = self._dims()
         best, fewest = home, int(self._touching(home))
@@ -116,8 +119,8 @@ class PostureSearch:
         return tuple(sorted(pairs))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """Return the number of pairs that are too close plus the number of arms that are too low, for postures [...,
-        D].
+        """Return for postures [..., D] the number of pairs that are too close plus the number of arms that are too
+        low.
         """
         near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
