@@ -632,8 +632,9 @@ def _folders(source: SourceDataset) -> set[str]:
 
 
 def _of_three(statistic: Statistic) -> Statistic:
-    """Return a statistic of a single channel with its figures repeated for three channels, which readers of v2.1
-    require.
+    """Return a statistic of a single channel with its figures repeated for three channels.
+
+    Readers of v2.1 require three.
     """
     figures = (name for name in statistic if name != "count")
     return statistic | {name: (statistic[name] * 3)[:3] for name in figures}

@@ -215,8 +215,7 @@ class Catalog:
         }
 
     def documents_before_data(self) -> dict[str, bytes]:
-        """Return by name the content of the files that are written before the data: tasks, and modality.json if it is
-        missing.
+        """Return the content by name of the files that are written before the data: tasks, and a missing modality.json.
 
         They may be written first because it does no harm if they list more than the data contain. An existing
         modality.json is left as it is, because users may edit it.
