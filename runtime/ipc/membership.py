@@ -13,8 +13,9 @@ _REST_S = 0.1
 
 
 def rest_s(heartbeat_timeout: float) -> float:
-    """Return for how long a process without a bell may sleep at a time [s], so that its heartbeats are frequent
-    enough.
+    """Return for how long a process without a bell may sleep at a time [s].
+
+    It is short enough for the heartbeats of the process.
     """
     return min(_REST_S, heartbeat_timeout / 10.0)
 
