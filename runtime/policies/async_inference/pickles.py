@@ -146,8 +146,9 @@ class Reader(pickle._Unpickler):
 
 
 class _Reader(Reader):
-    """Pickle interpreter for one list of TimedAction; it accepts only the classes and functions that such a list
-    names.
+    """Pickle interpreter for one list of TimedAction.
+
+    It accepts only the classes and functions that such a list names.
     """
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(Reader.dispatch)

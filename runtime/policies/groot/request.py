@@ -137,10 +137,9 @@ class Gr00tRequest:
         return ModelInput(observation.step, pictures, inputs["state"])
 
     def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
-        """Return the arguments of get_action: `prompt`, the newest input `moment`, and earlier inputs if the model
-        needs them.
+        """Return the arguments of get_action for `prompt` and the newest input `moment`.
 
-        `moment` is stored as long as later requests need it.
+        They include earlier inputs if the model needs them. `moment` is stored as long as later requests need it.
         """
         modalities = self._wanted
         assert modalities is not None, "configure comes first"
