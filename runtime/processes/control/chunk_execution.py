@@ -109,7 +109,7 @@ class ExecuteChunks(Behaviour):
         return Target(planned.action, self._source, "policy", planned.contributions)
 
     def ran_on(self, step: int, commanded: Float64) -> bool:
-        """Return True if the plan's action for `step` is no longer at `commanded` [D], the command at which the robot
+        """Return True if the plan for `step` has moved away from `commanded` [D], the command at which the robot
         stopped.
         """
         planned = self.timeline.at(step)
@@ -133,12 +133,11 @@ class ExecuteChunks(Behaviour):
         self._strategy, self._useless = chosen, False
 
     def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
-        """Merge a chunk into the plan from `step` on, the first step not sent yet; `commanded` [D] is the newest
-        command.
+        """Merge a chunk into the plan from `step` on, the first step not sent yet.
 
-        After this call the run no longer waits for its first chunk, even if this chunk was dropped. If the dropped
-        chunk was requested while the robot was stopped, an empty plan no longer counts as waiting either. So a policy
-        whose chunks are all dropped starves the run.
+        `commanded` [D] is the newest command. After this call the run no longer waits for its first chunk, even if this
+        chunk was dropped. If the dropped chunk was requested while the robot was stopped, an empty plan no longer
+        counts as waiting either. So a policy whose chunks are all dropped starves the run.
         """
         try:
             joined = self._join(chunk, step, commanded)

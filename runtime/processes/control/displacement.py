@@ -167,8 +167,7 @@ class DisplacementMonitor:
         )
 
     def reason(self, robot: RobotActuator, measured: Float64 | None) -> str:
-        """Return why no motion may begin from the commanded position: a joint is too far from it; "" if a motion may
-        begin.
+        """Return a message if a joint is too far from its command for a motion to begin, "" if a motion may begin.
 
         `measured` [D] is None if unknown; the result is then "".
         """
@@ -199,8 +198,9 @@ class DisplacementMonitor:
         )
 
     def converge_to_measured(self) -> None:
-        """Move the hold target to all measured joints, because the operator has asked for it; all joints are trusted
-        again.
+        """Move the hold target to all measured joints, and trust all joints again.
+
+        The operator has asked for this.
         """
         self.trust_all_joints()
         self._meeting = True

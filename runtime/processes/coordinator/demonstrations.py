@@ -198,8 +198,9 @@ class Demonstrations:
         return None
 
     def _update_first_goal(self) -> None:
-        """Give the set-up the pose to which the robot must move before it follows the leader; it changes as the leader
-        moves.
+        """Give the set-up the pose to which the robot must move before it follows the leader.
+
+        The pose changes as the leader moves.
         """
         relay = self._relay
         if relay is not None:

@@ -222,11 +222,10 @@ class HealthMonitor:
         self._lease_held = is_held
 
     def _goes_on_to(self, going: Run | None) -> float | None:
-        """Return the duration [s] up to which the run continues although its lease holder was lost; None if it does
-        not.
+        """Return the duration [s] up to which a run continues although its lease holder was lost.
 
-        Only a trial that has begun and has a limit of duration continues, and only if it can be stopped at the
-        station's panel and the deployment does not demand a hold.
+        None if it does not continue. Only a trial that has begun and has a limit of duration continues, and only if it
+        can be stopped at the station's panel and the deployment does not demand a hold.
         """
         if self._plan.deployment.lease.lost == "hold" or not self._lease.lost(self._people.now()):
             return None

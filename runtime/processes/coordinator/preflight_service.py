@@ -90,8 +90,9 @@ class PreflightService:
         return {"id": request.id, "longest_s": longest}
 
     def _require_free(self, request: PreflightRequest) -> None:
-        """Raise RuntimeFault if the station is at work, or if it is ready and the preflight would use its exclusive
-        policy server.
+        """Raise RuntimeFault if the station is at work.
+
+        Also if it is ready, and the preflight would use its exclusive policy server.
         """
         state = self._state()
         if state.meaning.at_work:

@@ -176,8 +176,9 @@ class ServedLockstep(Lockstep):
         )
 
     def _is_unpaced(self) -> bool:
-        """Return True if ticks may follow each other as fast as possible, because no operator watches them in real
-        time.
+        """Return True if ticks may follow each other as fast as possible.
+
+        That is so if no operator watches them in real time.
         """
         if self._paced:
             return False

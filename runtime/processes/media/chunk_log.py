@@ -74,8 +74,7 @@ class ChunkLog:
 
 
 def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
-    """Return position errors [m], rotation errors [rad] and flags of inverse kinematics for each row of the policy [H,
-    arms].
+    """Return position errors [m], rotation errors [rad] and IK flags for each row of the policy [H, arms].
 
     Several control steps may come from one row: its errors are the largest of theirs, and its flags are all of theirs.
     A row without steps has NaN and no flags. For a chunk of joints all three results are None.

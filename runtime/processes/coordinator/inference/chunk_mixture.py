@@ -89,10 +89,10 @@ class Mixture:
         return encoded
 
     def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
-        """Return True if the linear mixture `straight` equals `meant`, the mixture as control makes it, within
-        tolerance.
+        """Return True if the linear mixture `straight` equals `meant` within tolerance.
 
-        They differ, for example, if angles wrap. `like` is a chunk with the same columns.
+        `meant` is the mixture as control makes it. They differ, for example, if angles wrap. `like` is a chunk with the
+        same columns.
         """
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)

@@ -212,9 +212,7 @@ class Inference:
             self._post(proposal)
 
     def cancel(self) -> None:
-        """Discard the newest chunk, whether it was only requested, is shown as a proposal or was sent, and clear
-        failures.
-        """
+        """Discard the newest chunk, whether it is requested, shown as a proposal or sent, and clear failures."""
         self._flight, self._stale_since = None, None
         self.retry.reset()
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None

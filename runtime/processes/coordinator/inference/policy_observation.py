@@ -107,11 +107,11 @@ class PolicyObservation:
         return int(status["step"]), np.array(status["commanded"], np.float64)
 
     def _step_of(self, observation: Observation) -> int:
-        """Return the control step of an observation: that of the tick that used it; if no tick has used it yet, that of
-        the next tick.
+        """Return the control step of an observation.
 
-        If control has missed ticks, the next tick is more than one step ahead of the newest, because steps follow the
-        clock and missed ticks are skipped.
+        That is the step of the tick that used it or, if no tick has used it yet, of the next tick. If control has
+        missed ticks, the next tick is more than one step ahead of the newest, because steps follow the clock and missed
+        ticks are skipped.
         """
         status = self._shared_state.control.read()
         step, planned = int(status["step"]), float(status["planned"])

@@ -205,8 +205,9 @@ class SessionMachine:
         return self._not_now(command.kind)
 
     def _stops_without(self, command: Command) -> bool:
-        """Return True if the command is a stop that needs no lease: it comes from the station's panel, or the run is
-        unattended.
+        """Return True if the command is a stop that needs no lease.
+
+        That is so if it comes from the station's panel, or the run is unattended.
         """
         if command.kind not in STOPPING:
             return False

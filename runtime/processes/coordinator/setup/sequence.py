@@ -367,10 +367,9 @@ class SetUp:
         return self._start_reset()
 
     def _start_reset(self) -> bool:
-        """Start the reset of the bench, now that the arms are out of the way; if no reset was requested, start the
-        warm-up.
+        """Start the reset of the bench, now that the arms are out of the way.
 
-        Return True if the set-up is then complete.
+        If no reset was requested, start the warm-up. Return True if the set-up is then complete.
         """
         if self._reset is None:
             return self._start_warm_up()
