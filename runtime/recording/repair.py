@@ -205,10 +205,10 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 
 
 def _unproven(path: Path, closed: bool) -> str:
-    """Return a sentence that the episode had been closed before, so that facts of its end are lost; "" without such a
-    sign.
+    """Return a sentence that the episode had been closed before, so that facts of its end are lost.
 
-    Signs are an export of the episode, and, as `closed` states, that all its tables have an end mark.
+    "" without a sign of that. Signs are an export of the episode, and, as `closed` states, that all its tables have an
+    end mark.
     """
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None
