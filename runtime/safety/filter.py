@@ -288,8 +288,7 @@ class SafetyFilter:
     def _catch_up_velocity(
         self, requested: Float64, action: Float64, state: RobotState, path: Path
     ) -> Float64:
-        """Return the `requested` velocities, reduced for joints that lag behind their target, so that they do not
-        overshoot.
+        """Return the `requested` velocities, reduced for joints that lag behind their target.
 
         After a jump of the target, the command must not arrive with all the speed gathered on the way: its speed
         relative to the target is limited to one that can still be braked within the remaining distance.
