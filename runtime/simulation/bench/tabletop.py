@@ -177,9 +177,7 @@ class Tabletop:
         return max(heights)
 
     def _separate(self, block: Block, neighbour: Block, seconds: float) -> None:
-        """Slide a block away from another block that it overlaps, by at most the distance that is allowed in
-        `seconds`.
-        """
+        """Slide a block away from another block that it overlaps, at a limited speed for `seconds`."""
         if block.held_by or abs(block.pose[2, 3] - neighbour.pose[2, 3]) > 0.9 * block.edge:
             return
         offset = block.pose[:2, 3] - neighbour.pose[:2, 3]
@@ -192,7 +190,7 @@ class Tabletop:
     def _clear_rim(self, block: Block, seconds: float) -> None:
         """Slide a block that stands on the table and touches the plate's rim away from the plate.
 
-        It moves by at most the distance that is allowed in `seconds`.
+        It moves at a limited speed for `seconds`.
         """
         if block.bottom > self.bench.plate_height - _RIM:
             return

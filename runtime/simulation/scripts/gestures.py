@@ -64,7 +64,7 @@ class Gesture:
         return float(np.arctan2(sine, -minus_cosine))
 
     def towards(self, phase: float, q: Float64, seconds: float) -> Float64:
-        """Return the joints [D] reached from `q` in `seconds` if they move at limited speed to the path's point at
+        """Return the joints [D] after moving from `q` at limited speed for `seconds` towards the path's point at
         `phase`.
         """
         reach = self._speed * seconds
