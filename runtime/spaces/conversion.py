@@ -207,8 +207,9 @@ class ActionSpaces(EndEffectors):
         return layout.normalize_quaternions(vectors, f"the chunk is {chunk.mode} to an observation with")
 
     def _with_joints(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
-        """Return vectors of the whole robot [H, D]: `qpos` [D], with the joints that follow the poses taken from
-        `joints` [H, n].
+        """Return vectors of the whole robot [H, D]: `qpos` [D] with some joints replaced.
+
+        The joints that follow the poses in a row are taken from `joints` [H, n].
         """
         full = np.tile(qpos, (len(joints), 1))
         full[:, layout.dims] = joints
