@@ -78,8 +78,9 @@ class RosSink(Sink):
             publish(payload)
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Return the command topics that have no subscriber or have refused one, each with the reason, "" if it is
-        unknown.
+        """Return the command topics without a subscriber, or with one that was refused, and the reason.
+
+        The reason is "" if it is unknown.
         """
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
