@@ -119,9 +119,7 @@ class PostureSearch:
         return tuple(sorted(pairs))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """Return for postures [..., D] the number of pairs that are too close plus the number of arms that are too
-        low.
-        """
+        """Return how many pairs are too close plus how many arms are too low, for postures [..., D]."""
         near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
 
@@ -192,8 +190,7 @@ class PostureSearch:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """Return the cost of collisions, and of fingertips that are too low, at postures and on the straight path to
-        them.
+        """Return the cost of collisions and of low fingertips, at postures and on the straight path to them.
 
         It is proportional to the worst depth on the path.
         """
