@@ -16,7 +16,10 @@ from robots.urdf import Urdf
 
 
 def check_arm(key: str, table: GroupTable) -> None:
-    """Raise RobotError unless end effector and frame are declared together, and other keys for arms only with both."""
+    """Raise RobotError if a group declares only some of the keys that make it an arm.
+
+    End effector and frame must be declared together; kind "arm", pinned joints and a tip of the gripper require both.
+    """
     if (table.eef_link is None) != (table.frame is None):
         raise RobotError(f"{key}: eef_link and frame make an arm together; allowed: both or neither")
     if table.eef_link is not None:

@@ -126,7 +126,7 @@ def _declared(table: CapsuleTable) -> Capsule:
 def _balls(link_shapes: Sequence[Shape]) -> tuple[Float64, Float64]:
     """Return balls whose convex hull covers the shapes: centres [n, 3] in the link's frame, and radii [n].
 
-    The corners of shapes have radius 0.
+    A shape with corners is represented by balls of radius 0 at its corners.
     """
     centres, sizes = [], []
     for shape in link_shapes:

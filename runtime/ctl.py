@@ -137,9 +137,9 @@ def _move(client: StationClient, options: argparse.Namespace) -> int:
 
 
 def _jog(client: StationClient, options: argparse.Namespace) -> int:
-    """Show the result of an aim, and move there: exactly to the joints that were shown.
+    """Show the joints to which a jog leads, then move to exactly these joints.
 
-    Raises: Refused if they are not the requested pose, unless --nearest is given.
+    Raises: Refused if they do not reach the requested pose, unless --nearest is given.
     """
     aim = client.query("aim", **aim_text.aim_arguments(client, options)).data
     _show_aim(client, aim, options)

@@ -38,7 +38,10 @@ class PoseDraft:
 
 @dataclass(frozen=True, slots=True)
 class GroupDraft:
-    """Group of a draft; `numbers` are its names in messages, with the gripper's last. `rest` are its values at home."""
+    """Group of a draft.
+
+    `numbers` are the names of its values in messages, with the gripper's last. `rest` are its values at home.
+    """
 
     name: str
     kind: Kind

@@ -24,11 +24,11 @@ _PREFERRED = (*_GRASPS, "tool0", "ee", "tip", "flange", "hand")
 
 @dataclass(frozen=True, slots=True)
 class GripperDraft:
-    """Suggested gripper: its number is the position of `driver`; `fingers` are the joints' values at `lower` and
-    `upper`.
+    """Suggested gripper, whose value in messages is the position of the joint `driver`.
 
-    `apart` is the distance [m] by which the fingers part from `close` to `open`, None if they do not; `tip` [7] is in
-    the end effector. `placeholder_notes` are sentences about placeholders.
+    `fingers` are for each finger joint its values when the gripper is at `lower` and at `upper`. `apart` is the
+    distance [m] by which the fingers part from `close` to `open`, None if they do not; `tip` [7] is the frame between
+    the fingertips in the end effector. `placeholder_notes` are sentences about placeholders.
     """
 
     driver: str
@@ -179,8 +179,8 @@ class _Jaws:
     def tip(self, closed: Mapping[str, float], *, named: bool) -> Float64:
         """Return the frame [7] between the fingertips in the end effector: z ahead, y in the opening direction.
 
-        Its position comes from the fingers' shapes; without shapes it is that of the end effector, if that has a name
-        as for grasping.
+        Its position comes from the fingers' shapes. Without shapes it is the origin of the end effector if that is
+        `named` like a frame for grasping, else midway between the ends of the fingers.
         """
         at = self._in_eef(closed)
         points = [self._point(index, at) for index in range(len(self._ends))]

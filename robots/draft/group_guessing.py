@@ -118,7 +118,10 @@ class _Skeleton:
         return carriers
 
     def runs(self, without: set[str]) -> list[tuple[tuple[str, ...], bool]]:
-        """Return the unbranched rows of joints, outwards, each with whether its branch of the tree ends with it."""
+        """Return the unbranched rows of joints, outwards, without the joints in `without`.
+
+        Each row comes with True if no joint follows its last one.
+        """
         result: list[tuple[tuple[str, ...], bool]] = []
         starts = self.children(None, without)
         for start in starts:  # the list grows during the loop
@@ -236,7 +239,11 @@ def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
 
 
 def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
-    """Return the limbs; if there are two arms without a side, with left and right by where they begin (y is left)."""
+    """Return the limbs, with a side for each of two arms that have none.
+
+    The arm that begins at larger y is the left one. Nothing is assigned unless one arm begins clearly on each side of y
+    = 0.
+    """
     arms = [limb for limb in limbs if limb.kind == "arm"]
     if len(arms) != 2 or any(arm.side for arm in arms):
         return list(limbs)

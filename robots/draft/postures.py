@@ -56,7 +56,10 @@ class PostureSearch:
         self._draw = np.random.default_rng(0)  # fixed seed: the same URDF gives the same draft
 
     def home(self) -> Float64:
-        """Return the home pose, or the nearest posture with the fewest touching links, mirrored for mirrored arms."""
+        """Return the home pose, or, if links touch in it, the nearest posture found with the fewest touching pairs.
+
+        Mirrored arms have mirrored postures.
+        """
         home = self._robot.poses["home"]
         dims = self._dims()
         best, fewest = home, int(self._touching(home))
@@ -80,7 +83,10 @@ class PostureSearch:
         return best
 
     def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
-        """Return the posture after moving every joint back to home for which this adds no touching pair."""
+        """Return the posture with as many joints as possible moved back to their home values.
+
+        One joint after the other is moved, and stays there if not more than `fewest` links touch then.
+        """
         for dim in self._dims():
             tried = q.copy()
             tried[dim] = home[dim]
@@ -113,9 +119,7 @@ class PostureSearch:
         return tuple(sorted(pairs))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """Return the number of pairs that are too close plus the number of arms that are too low, for postures [...,
-        D].
-        """
+        """Return how many pairs are too close plus how many arms are too low, for postures [..., D]."""
         near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
 
@@ -186,7 +190,10 @@ class PostureSearch:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """Return a cost for how deep links collide, or fingertips are too low, at the posture and on the path to it."""
+        """Return the cost of collisions and of low fingertips, at postures and on the straight path to them.
+
+        It is proportional to the worst depth on the path.
+        """
         path = home + _LOOKED_AT[:, None, None] * (q - home)
         deep = np.maximum(2 * CLEAR - self._apart(path), 0.0) + np.maximum(
             _LOWEST - self._heights(path), 0.0

@@ -1,5 +1,6 @@
-"""URLs of network cameras: checks, and insertion of passwords, which come from the environment and are never
-recorded.
+"""URLs of network cameras: checks, and insertion of passwords.
+
+Passwords come from the environment and are never recorded.
 """
 
 from __future__ import annotations

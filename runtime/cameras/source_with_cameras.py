@@ -112,7 +112,7 @@ class SourceWithCameras(Source):
         return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._health_dict(camera)})
 
     def _warning(self, camera: Camera) -> Event:
-        """Return the warning that the policy receives a video instead of this camera's view of the robot."""
+        """Return the event that warns that the camera plays a video file, so that the policy does not see the robot."""
         text = _PLAYS_VIDEO(camera=camera.key, video=camera.shown)
         return Event("camera_is_a_video", text, self._clock.now(), data={"camera": camera.key})
 

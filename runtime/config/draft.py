@@ -62,9 +62,10 @@ def kinds(part: str) -> dict[str, str]:
 
 
 def entries(part: str, kind: str) -> tuple[Entry, ...]:
-    """Return the keys of the table of a part of that kind, those that only this kind has first.
+    """Return the keys of the table that configures a part (a key of PACKAGES) with a `kind`.
 
-    Raises ConfigurationError, which lists the known kinds.
+    Keys that only this kind has come before those that all kinds have. Raises ConfigurationError, which lists the known
+    kinds.
     """
     kinds = variants(PACKAGES[part])
     if kind not in kinds:

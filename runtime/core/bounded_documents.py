@@ -94,7 +94,8 @@ def _require_small(text: str | bytes, what: str, largest: int) -> None:
 def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MAX_ITEMS) -> None:
     """Raise UnreadableDocument if the nesting or the number of values exceeds its limit.
 
-    It counts brackets, commas and the dots of keys outside strings: never fewer levels than a parser would create.
+    The nesting is estimated from brackets and the dots of keys outside strings, values from brackets, commas and "=".
+    The estimate of the nesting is never lower than the number of levels that a parser would create.
     """
     depth = dots = values = 0
     for mark in marks.finditer(text):

@@ -61,7 +61,7 @@ class VirtualClock(Clock):
 
 
 class _StepCandidate(NamedTuple):
-    """Messages that are equally late, and later than a message before them."""
+    """Sequence of messages that may prove a clock step: they are equally late, and later than a message before them."""
 
     first: float  # arrival of the first late message
     since: float  # arrival of the first of the equally late messages
@@ -150,16 +150,16 @@ class ClockStepDetector:
         return max(_LEAST_S, 3.0 * sorted(self._noise)[len(self._noise) * 9 // 10])
 
     def _off_more(self, moved: float, waited: float) -> float:
-        """Return how much farther from the stream's period the stamp is than the arrival [s].
+        """Return the stamp's distance from the stream's period, minus that of the arrival [s].
 
-        `moved` is the interval of stamps, `waited` that of arrivals [s].
+        `moved` is the interval since the previous stamp, `waited` that since the previous arrival [s].
         """
         period = max(sorted(self._intervals)[len(self._intervals) // 2], _LEAST_S / 10)
         return _off(moved, period) - _off(waited, period)
 
 
 def _off(interval: float, period: float) -> float:
-    """Return the distance of an interval from the nearest multiple of the period, at least one period [s]."""
+    """Return the distance of an interval from the nearest multiple of the period, where zero is no multiple [s]."""
     return abs(interval - max(1, round(interval / period)) * period)
 
 

@@ -133,7 +133,7 @@ def rewritten(text: str, change: Callable[[str], str]) -> str:
 
 
 def shows(text: str, arguments: Mapping[str, Any]) -> bool:
-    """Return True if all arguments (wire form) appear in the text, so that sending them reveals nothing more."""
+    """Return True if all arguments (wire form) appear in the text, so that they reveal no more than the text does."""
     for value in arguments.values():
         if isinstance(value, Mapping):
             nested = str(value.get("text"))

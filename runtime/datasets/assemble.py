@@ -289,8 +289,10 @@ class _Assembly:
         return written(splits)
 
     def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
-        """Return the lines of the list of episodes, with the keys that only the sources' writers know, if they can be
-        written.
+        """Return the lines of the list of episodes.
+
+        They keep the keys of the sources' lines that the format does not define; a key whose values cannot be written
+        in this version is reported as left out.
         """
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]
@@ -548,8 +550,9 @@ class _Assembly:
 
 
 def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
-    """Return the lines by the index of their episode. Raises: RecordingError if two lines are about the same
-    episode.
+    """Return the lines by the index of their episode.
+
+    Raises: RecordingError if two lines are about the same episode.
     """
     by_index = {line["episode_index"]: line for line in lines}
     if len(by_index) < len(lines):
@@ -562,15 +565,19 @@ def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
 
 
 def _is_its_own(path: Path, root: Path) -> bool:
-    """Return True if `path` leads into the dataset, or into the cache in which a hub keeps a snapshot's files."""
+    """Return True if `path` is in the dataset, or in the cache to which a hub's snapshot links.
+
+    Links are resolved first.
+    """
     resolved = root.resolve()
     places = (resolved, resolved.parent.parent / "blobs")
     return any(path.resolve().is_relative_to(place) for place in places)
 
 
 def _changed(original: pa.Array, converted: pa.Array) -> str:
-    """Return a sentence on the first value that a cast to another type changed by more than float32 rounds; "" if
-    none.
+    """Return a sentence about the first value that the conversion to another type has changed noticeably, else "".
+
+    Changes by rounding to float32 are permitted.
     """
     before, after = (
         np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (original, converted)
@@ -625,8 +632,9 @@ def _folders(source: SourceDataset) -> set[str]:
 
 
 def _of_three(statistic: Statistic) -> Statistic:
-    """Return a statistic with the single channel's figures repeated three times: readers of v2.1 refuse other
-    numbers.
+    """Return a statistic of a single channel with its figures repeated for three channels.
+
+    Readers of v2.1 require three.
     """
     figures = (name for name in statistic if name != "count")
     return statistic | {name: (statistic[name] * 3)[:3] for name in figures}

@@ -215,10 +215,10 @@ class Catalog:
         }
 
     def documents_before_data(self) -> dict[str, bytes]:
-        """Return the content by name of the files that are written before the data, since they may list more than
-        exists.
+        """Return the content by name of the files that are written before the data: tasks, and a missing modality.json.
 
-        An existing modality.json is left as it is, because users may edit it.
+        They may be written first because it does no harm if they list more than the data contain. An existing
+        modality.json is left as it is, because users may edit it.
         """
         v30 = self.version == layout.V30
         documents = (

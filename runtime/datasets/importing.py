@@ -39,7 +39,11 @@ ACTION = "action"
 
 @dataclass(frozen=True, slots=True)
 class SourceRobot:
-    """Facts that a dataset lacks: `state` is its column of measured joints, `robot` the robot that they belong to."""
+    """Facts for an import that a dataset does not state.
+
+    `state` names the column of measured joints; `robot` is the described robot that has these joints, "" if there is
+    none.
+    """
 
     state: str = ""
     robot: str = ""

@@ -110,7 +110,10 @@ def publish(
 
 
 def never_published(manifest: Mapping[str, object]) -> str:
-    """Return why the run with this manifest may never be published, as a clause to follow its name; "" if it may be."""
+    """Return why the run with this manifest may never be published, "" if it may be.
+
+    The reason is a clause that continues a sentence which begins with the episode's name.
+    """
     if manifest.get("kind") == IMPORTED:
         return "was imported: the dataset that it was imported with holds it, and can be converted, merged and split"
     if manifest.get("mode") != SIMULATED:
@@ -191,8 +194,9 @@ def _publish(
 
 
 def _with_success(journal: FinishedEpisode, catalog: Catalog, success: bool | None) -> bool:
-    """Return whether the episode's success is published: if the dataset has that column, or in a new one if it is
-    known.
+    """Return True if a success column is published for the episode.
+
+    An existing dataset decides this by its columns; a new dataset gets the column if the success is known.
 
     Raises: RecordingError if the dataset has the column and the success is not known.
     """

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 class RecordedEpisode:
     """One episode in memory, except its images; row k of an array belongs to frame k of a video.
 
-    float32 `qpos`, `qvel`, `effort`, `action` [N, D] and `eef`, `action_eef` [N, 8 * arms] as stored, None
-    if the mapping names no column; `timestamps` float64 [N] s from the episode's start; `captured` capture
-    times float64 [N] s by stream.
+    `qpos`, `qvel`, `effort` and `action` are float32 [N, D], `eef` and `action_eef` float32 [N, 8 * arms], all as
+    stored; each except `qpos` is None if the mapping names no column for it. `timestamps` float64 [N] are seconds from
+    the episode's start. `captured` has for each stream the capture times float64 [N] [s].
     """
 
     index: int

@@ -59,8 +59,9 @@ def _lock(root: Path) -> int:
 def recover(root: Path) -> None:
     """Undo an interrupted publication; the caller must hold the lock.
 
-    The plan of that publication names its files. If info.json does not count the episode, they are removed, with every
-    line about it. If it does, the files remain, in either version: publishing the episode again completes it.
+    The plan of that publication names the files of its episode. If info.json does not count the episode yet, these
+    files are removed, and so are all lines about the episode. If info.json counts it, all files remain, whether they
+    are from before or after the publication: publishing the episode again completes it.
     """
     staging = root / FOLDER
     if not staging.exists():

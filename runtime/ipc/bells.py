@@ -33,7 +33,7 @@ class Bell:
             self.hush()
 
     def hush(self) -> None:
-        """Reset the bell. Call it before reading shared memory: whatever is written later rings again."""
+        """Reset the bell. Call it before reading shared memory, so that later data ring it again."""
         with suppress(BlockingIOError):  # it was not rung
             os.eventfd_read(self.descriptor)
 

@@ -271,7 +271,7 @@ class Endpoints:
             ) from None
 
     def served(self, process: str) -> bool:
-        """Return True if `process` has written its endpoints and is alive."""
+        """Return True if the file of `process` exists and the process that wrote it is alive."""
         try:
             os.kill(int(self._content(process)["pid"]), 0)
         except PermissionError:  # it exists, under another account

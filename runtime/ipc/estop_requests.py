@@ -143,8 +143,9 @@ _READ_WHOLE, _WINDOW = 8192, 4096  # characters
 def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
     """Return the fields of a press in JSON, {} if they cannot be read; None if the message is no press.
 
-    `keys` are the keys under which such a message has its kind: {"type": "estop"}. "web:estop" and "estop:REASON" are
-    valid kinds too. A message much longer than a press is searched only at its beginning and its end.
+    A message is a press if its kind is "estop", "web:estop" or "estop:REASON". `keys` are the names under which a
+    message may have its kind, for example "type". A message much longer than a press is searched only at its beginning
+    and its end.
     """
     text = said if isinstance(said, str) else said.decode(json.detect_encoding(said), "replace")
     text = text.lstrip("\ufeff \t\r\n")
@@ -174,7 +175,7 @@ def _fields(parts: Sequence[str]) -> dict[str, Any]:
 
 
 def _loosely(text: str, keys: Sequence[str]) -> bool:
-    """Return True if the text contains a press under one of `keys`, however malformed."""
+    """Return True if the text contains one of `keys` with a press as its value, even if it is not valid JSON."""
     bare = _ESCAPED.sub(lambda code: chr(int(code[1], 16)), text).replace("\\", "")
     return re.search(_LOOSE % "|".join(keys), bare) is not None
 

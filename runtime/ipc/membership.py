@@ -13,7 +13,10 @@ _REST_S = 0.1
 
 
 def rest_s(heartbeat_timeout: float) -> float:
-    """Return the sleep time of a process without a bell [s]: its heartbeats must stay within the timeout."""
+    """Return for how long a process without a bell may sleep at a time [s].
+
+    It is short enough for the heartbeats of the process.
+    """
     return min(_REST_S, heartbeat_timeout / 10.0)
 
 
@@ -26,5 +29,8 @@ class Membership:
     lifeline: Lifeline
 
     def is_needed(self, now: float) -> bool:
-        """Return True while the supervisor lives, or control does; for a process that must outlive control."""
+        """Return True while the supervisor lives or control still ticks.
+
+        For a process that control needs to its end.
+        """
         return not self.lifeline.is_cut or self.shared.alive("control", now, _OUTLIVES_S)

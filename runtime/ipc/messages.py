@@ -75,7 +75,7 @@ class PostedChunk:
 
 @dataclass(frozen=True, slots=True)
 class Tune:
-    """Strategy from the next tick on: its whole section, as in a deployment."""
+    """Order to use another strategy from the next tick on; `strategy` is a whole section as in a deployment."""
 
     strategy: Mapping[str, Any]
 
@@ -183,11 +183,12 @@ class BeginEpisode:
 
 @dataclass(frozen=True, slots=True)
 class PolicyAnswer:
-    """Chunk as received from the policy; `source_rows` [H'] is the row that each posted row was made from.
+    """Chunk as received from the policy.
 
-    For poses, the errors float64 [H', arms] in m and rad, and the flags uint8 [H', arms] (bits of
-    kinematics.base.IkFlag), describe how well the posted rows reach them. `eef` is the origin of the poses in the
-    observation: "measured" or "fk".
+    Control receives other rows, which were made from these; `source_rows` [H'] is for each row that was sent to control
+    the index of its row here. For poses, the errors float64 [H', arms] in m and rad, and the flags uint8 [H', arms]
+    (bits of kinematics.base.IkFlag), describe how well the rows sent to control reach them. `eef` is the origin of the
+    poses in the observation: "measured" or "fk".
     """
 
     chunk_id: int

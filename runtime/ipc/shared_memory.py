@@ -59,9 +59,9 @@ class TornReadError(RuntimeFault):
 class Record:
     """Structured record with one writer and any number of readers.
 
-    It is double-buffered, so that a preempted writer never makes it unreadable. The checksum is seeded with the
-    version. Therefore a read is correct also with weakly ordered memory, and if the reader was delayed between version
-    and content: the bytes then belong to another version, and their checksum does not match.
+    It is double-buffered, so that a preempted writer never makes it unreadable. The checksum includes the version. A
+    reader therefore notices if the content that it read belongs to another version than the version that it read,
+    because it was delayed in between or because the processor reorders memory accesses.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:

@@ -16,8 +16,8 @@ Make = Callable[[], Kinematics]
 class LazyKinematics(Kinematics):
     """Kinematics with a backend that is built in the background on first use; `forward` works at once.
 
-    `make` builds the backend, once; `aside` runs it in the background. A station with a policy in joint space starts
-    without a compiler and never loads one.
+    `make` builds the backend and is called at most once; `aside` calls a function in the background and returns its
+    future. A station with a policy in joint space starts without a compiler and never loads one.
     """
 
     def __init__(

@@ -158,7 +158,7 @@ class _Arm:
         return reference, steps
 
     def _cut(self, q: Float64, task: _ArmTask, steps: Float64, reference: Float64) -> Float64:
-        """Return the rows [T, n] clipped in float64 to joint limits and to their `steps` from the row before.
+        """Return the rows [T, n], clipped in float64 to joint limits and to the largest `steps` between rows.
 
         The anchor's row is clipped to its step from `reference`.
         """

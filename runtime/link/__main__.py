@@ -78,7 +78,10 @@ def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
 
 
 def _uploads() -> UploadSettings | None:
-    """Return the upload settings; None if they are invalid, which only stops the sending of episodes."""
+    """Return the upload settings.
+
+    If they are invalid, log that and return None: the link then works, but sends no episodes.
+    """
     try:
         return UploadSettings.read(os.environ)
     except ConfigurationError as error:
@@ -87,7 +90,7 @@ def _uploads() -> UploadSettings | None:
 
 
 def _written(data: Path, station_dir: Path) -> list[tuple[int, int]]:
-    """Return the identity of the key files, which changes when the files are replaced."""
+    """Return inode and modification time of the key files, which change when the files are replaced."""
     statuses = [path.stat() for path in (known_lab_path(station_dir), key_path(data)) if path.exists()]
     return [(status.st_ino, status.st_mtime_ns) for status in statuses]
 

@@ -65,8 +65,8 @@ class AllowList:
     def refused(self, key: str, address: str, now: float) -> bool:
         """Record a handshake; return True if it must be refused.
 
-        The key of a station, or the address of an unknown key, is then temporarily refused or makes too many
-        handshakes.
+        It is refused if its key is temporarily refused or makes too many handshakes. If no station has the key, its
+        address is counted in place of the key.
         """
         name = key if key in self.now.stations else address
         with self._lock:

@@ -149,7 +149,7 @@ class Door:
     def _message(self) -> list[zmq.Frame]:
         """Return the frames of the next complete message, [] if there is none.
 
-        If a message has too many parts, only one part beyond the limit is kept.
+        Of a message with too many parts, only so many are kept that it is recognised as too long.
         """
         with suppress(zmq.Again):
             while self._room:
@@ -371,7 +371,7 @@ def _break(connection: sockets.socket) -> None:
 
 
 def _same(descriptor: int) -> sockets.socket:
-    """Return a new socket object for the same connection, over a duplicate of the descriptor.
+    """Return a new socket object for the connection with this descriptor, over a duplicate of the descriptor.
 
     Raises: OSError if the descriptor is not a socket.
     """

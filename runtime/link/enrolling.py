@@ -23,7 +23,7 @@ Enroller = Callable[[str, str, str], Enrolled | str]
 
 
 class Enrolling:
-    """Attempts to enrol and their results. One thread calls `request` and `answers`; neither blocks."""
+    """Attempts to enrol and their results. One thread calls `request` and `answers`; both return at once."""
 
     def __init__(self, enrol: Enroller, clock: Callable[[], float] = time.monotonic) -> None:
         self._enrol, self._clock = enrol, clock

@@ -62,7 +62,7 @@ _NOT_RUNNING = "its computer is linked, and the station does not run there: star
 
 
 class Gate:
-    """Lab's end of the link, with its first port.
+    """Lab's end of the link, with the port for stops and commands; `LabStreams` has the other port.
 
     One thread uses it and calls `turn`; only `linked` may be called from any thread.
     """
@@ -187,7 +187,10 @@ class Gate:
             self._pass_command(remote, queued, (COORDINATOR, "commands"), server)
 
     def _pass_press(self, remote: Remote, press: PendingPress) -> bool:
-        """Send a press over a live connection, preferably that for stops; return False if there is none."""
+        """Send a press over the station's connection for stops, or over that for commands if the former is silent.
+
+        Return False if neither is alive or the press cannot be sent.
+        """
         now = self._clock()
         line = remote.line(STOPS, now) or remote.line(COMMANDS, now)
         if line is None or remote.mirror is None:
@@ -227,7 +230,11 @@ class Gate:
         """Send a command, with a token if its user is verified.
 
         Args:
-            said: Payload, and whether its user is verified because the web has signed it.
+            remote: Station that gets the command.
+            line: Connection to use.
+            place: Process and name of the socket that the command is for.
+            signed: Payload, and whether its user is verified because the web has signed it.
+            stops: Whether the command is a stop.
 
         Returns:
             Number of the request; 0 if it could not be sent.
@@ -431,13 +438,16 @@ class Gate:
             self._give_up(remote, remote.held.pop(0))
 
     def _lower(self, remote: Remote, reason: str) -> None:
-        """Publish the reason why the station cannot be commanded."""
+        """Make the station appear as lost, and publish `reason`, why it cannot be commanded."""
         if remote.told != reason and remote.mirror is not None:
             remote.mirror.lower(reason)
             self._log_once(remote, reason)
 
     def _hold_on(self, remote: Remote, now: float) -> None:
-        """Answer the senders of held presses if the link stays lost, and drop presses older than `_HELD_S`."""
+        """Answer the senders of held presses if the link does not return soon.
+
+        These presses are still sent if it returns; presses older than `_HELD_S` are dropped.
+        """
         for press in list(remote.held):
             link_lost = now - remote.lost_at > _HOPE_S  # lost before the press
             if link_lost or now - press.at > _HOPE_S:

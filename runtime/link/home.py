@@ -107,10 +107,9 @@ class Home:
         return None
 
     def arrived(self, episode: str, contents: Contents) -> None:
-        """Record that the lab has verified the episode. Raises: RecordingError.
+        """Record in a receipt that the lab has verified the episode. Raises: RecordingError.
 
-        A receipt is written. If the episode was offered again because its retention time is over, it is removed
-        instead.
+        If there is a receipt with the same content already, and its retention time is over, remove the episode instead.
         """
         stored = self._receipts.get(episode)
         if stored is not None and stored.digest == contents.digest and self._over(stored):
@@ -125,7 +124,7 @@ class Home:
         self._store_receipt(replace(self._receipts[episode], labels=hashlib.sha256(lines).hexdigest()))
 
     def put_off(self, what: str, seconds: float) -> None:
-        """Do not offer `what` for `seconds` [s]: an episode, or labels under the name "labels UUID"."""
+        """Do not offer `what` for `seconds` [s]: the uuid of an episode, or "labels UUID" for its labels."""
         self._put_off[what] = self._clock() + seconds
 
     # --- scan ---------------------------------------------------------------------------------------------------
@@ -146,9 +145,9 @@ class Home:
         self._look_at = self._clock() + max(_LOOK_S, _LOOK_SHARE * (self._clock() - now))
 
     def _sort_in(self, name: str) -> None:
-        """Decide whether a new folder is an episode to send.
+        """Record a new folder as an episode to send, or as one of another station.
 
-        The recorder writes the outcome last: an episode without it is not closed.
+        A folder without an outcome is skipped until later: the recorder writes the outcome last.
         """
         try:
             closed = (self._root / name / OUTCOME).stat().st_mtime
@@ -167,7 +166,7 @@ class Home:
     # --- receipts ------------------------------------------------------------------------------------------------
 
     def _read(self) -> list[Receipt]:
-        """Return the receipts of this lab; a receipt of another lab does not mean that this one has the episode."""
+        """Return the receipts of episodes that this lab has verified; receipts of other labs are ignored."""
         receipts = []
         for path in (self._data / UPLOADS / self._station).glob("*.json"):
             try:

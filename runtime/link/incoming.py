@@ -326,9 +326,9 @@ class Shelf:
         return self._arrived(begun.episode, begun.contents)
 
     def _answer_existing(self, episode: str, contents: Contents) -> Message:
-        """Return the answer for an episode that the lab has already.
+        """Return the answer to an offered episode that the lab has already: it has arrived if the contents are equal.
 
-        An offer with other content is declined; nothing is overwritten.
+        An offer with other contents is declined; nothing is overwritten.
         """
         existing = contents_of(self._episodes / episode)
         if existing != contents:

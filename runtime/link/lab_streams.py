@@ -292,7 +292,7 @@ class LabStreams:
                 self._cut_sender(arrival.route, "it sends data that was not requested")
 
     def _answer_senders(self) -> None:
-        """Send the answers about episodes, and count what each station may send now."""
+        """Send the answers about episodes, and update how many pieces and offers each station may still send."""
         for route, message in self._incoming.answers() if self._incoming is not None else ():
             sender = self._senders.get(route)
             if sender is None:

@@ -88,7 +88,7 @@ class Mirror:
 
     @property
     def waiting(self) -> bool:
-        """True if messages are queued that no further readiness of a socket will announce."""
+        """True if messages are queued although their socket will not become readable again."""
         return self.estop_turns.has_waiting or (
             self.command_turns is not None and self.command_turns.has_waiting
         )

@@ -55,7 +55,10 @@ class _Free:
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """Answer to the request `number`: as the station encoded it, or the reason why there is none."""
+    """Answer to the request `number`.
+
+    `packed` is the answer as the station encoded it; if there is none, `failure` is the reason.
+    """
 
     number: int
     packed: bytes = b""

@@ -27,7 +27,11 @@ _LARGEST_SERIAL = (1 << 63) - 1
 
 
 def _signed(station: str, challenge: bytes, serial: int, place: str, payload: bytes) -> bytes:
-    """Return the bytes to sign: fixed layout except two texts, which contain no zero byte and so cannot overlap."""
+    """Return the bytes to sign.
+
+    All parts have a fixed length except two texts; each of these ends with a zero byte and contains none, so that
+    different arguments never give the same bytes.
+    """
     label = f"{station}\0{place}\0".encode()
     return _DOMAIN + label + challenge + serial.to_bytes(8, "big") + hashlib.sha256(payload).digest()
 

@@ -16,9 +16,9 @@ _NOT_RUNNING = "the process of the link does not run"
 
 @dataclass(frozen=True, slots=True)
 class Uplink:
-    """State of the link: name of the lab, since when [Unix time, s] and why it is down.
+    """State of the link: name of the lab, and if the link is down, since when and why.
 
-    `since` is 0 while it is up.
+    `since` is the Unix time [s] at which it went down, 0 while it is up; `why` is then "".
     """
 
     lab: str

@@ -89,7 +89,7 @@ def _number(
 
 
 class Runs:
-    """Monitor of the station's published state, for whether a run or a recording is active."""
+    """Monitor of the station's published state that reports whether a run or a recording is active."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, clock: Callable[[], float]) -> None:
         self._context, self._clock = context, clock
@@ -203,7 +203,7 @@ class Uploads:
         poller.poll(wait_ms)
 
     def _forget(self) -> None:
-        """Drop the offer and its requests: they belong to a connection or an answer that has ended."""
+        """Drop the offer and the requested pieces, because the connection has ended or the offer was answered."""
         self._offered = self._reading = None
         self._wanted.clear()
 

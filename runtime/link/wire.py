@@ -100,7 +100,10 @@ class Ask:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Answer of the station to the `Ask` of that number: the part that follows, or the reason why there is none."""
+    """Answer of the station to the `Ask` with that number.
+
+    The part that follows is the answer; if there is none, `failure` is the reason.
+    """
 
     number: int
     failure: str = ""

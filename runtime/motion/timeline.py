@@ -51,9 +51,10 @@ class PlacedChunk:
 
 @dataclass(frozen=True, slots=True)
 class Fade:
-    """Outgoing actions from which the plan takes over, from step `first` on.
+    """Transition from outgoing actions to the plan, from step `first` on.
 
-    `rows` are float64 [L, D], `contributions` those of each row, `weights` [L] the weight of each row in the blend.
+    `rows` float64 [L, D] are the outgoing actions, `contributions` those of each row, and `weights` [L] the weight of
+    each row in the blend with the plan.
     """
 
     first: int
@@ -130,7 +131,10 @@ class Timeline:
     def replace(
         self, step: int, rows: Float64, makers: Sequence[Contributions], laid: tuple[PlacedChunk, ...] = ()
     ) -> None:
-        """Replace the whole plan by `rows`, which begin at `step`; a fade that has ended by then is removed."""
+        """Replace the whole plan by `rows` [N, D], which begin at `step`; a fade that has ended by then is removed.
+
+        `makers` are the contributions of each row, `laid` the placed chunks that the strategy still needs.
+        """
         self.first = step
         self.rows = np.array(rows, np.float64)
         self.makers = list(makers)

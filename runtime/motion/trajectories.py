@@ -56,7 +56,10 @@ class Brake(Motion):
         return position
 
     def velocity(self, elapsed: float) -> Float64:
-        """Return the velocity [D] at `elapsed` [s], which is less than the mean over a tick that ends then."""
+        """Return the velocity [D] at `elapsed` [s].
+
+        It is less than the mean velocity over a tick that ends at that time.
+        """
         velocity = np.sign(self._velocity) * np.maximum(
             np.abs(self._velocity) - self._deceleration * elapsed, 0.0
         )

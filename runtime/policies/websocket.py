@@ -78,8 +78,9 @@ class WebsocketPolicy(Policy):
 
     @abstractmethod
     def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
-        """Check the server's metadata. Raises PolicyError, after which the connection is dropped, if it is the wrong
-        server.
+        """Check the server's metadata and return the policy's description.
+
+        Raises PolicyError if it is the wrong server; the connection is then dropped.
         """
 
     def connect(self) -> PolicyInfo:
@@ -137,8 +138,9 @@ class WebsocketPolicy(Policy):
     def _exchange(self, request: bytes) -> tuple[bytes, float]:
         """Return the response to `request` and its round trip [ms].
 
-        If a response may belong to an earlier request, the request is sent once more over another connection, whose
-        first response cannot. If the server responds in the same way there, the suspicion is dropped from then on.
+        If a response may belong to an earlier request, the request is sent once more over a new connection, whose first
+        response cannot be to an earlier one. If the server responds in the same way there, the reason for the suspicion
+        is ignored from then on.
         """
         seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
         self._warm = True

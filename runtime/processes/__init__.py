@@ -1,1 +1,1 @@
-"""The processes of a station, which do not know each other; nothing below imports them."""
+"""The processes of a station. None of them imports another, except lockstep, which runs all of them."""

@@ -24,8 +24,8 @@ class ProcessContext(Membership):
 def join_station(process: str, pictures: bool = True, unread: Collection[str] = ()) -> ProcessContext:
     """Parse the supervisor's command line, start the log, and attach the shared state.
 
-    `pictures`: attach the pictures too. `unread` names sections of the deployment that are not loaded, see
-    `load_checked_spec`.
+    The shared pictures are attached only if `pictures` is True. `unread` names sections of the deployment that are not
+    loaded, see `load_checked_spec`.
     """
     parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)

@@ -165,7 +165,10 @@ class MotionCheck:
 
 
 class _TrackingDelay:
-    """Error between action and measured state for delays of 0 to `wait` rows, and the delay at which it is smallest."""
+    """Errors between action and measured state for assumed delays of 0 to `wait` rows.
+
+    The delay with the smallest error is the robot's delay.
+    """
 
     def __init__(
         self, wait: int, joints: JointSpecs, settings: QualitySettings, flags: FlagCollector, stream: str

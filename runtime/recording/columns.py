@@ -17,9 +17,9 @@ from runtime.recording.layout import Layout
 
 
 class RecordedRow(NamedTuple):
-    """Row without its pictures, and the cameras whose frame repeats the previous one.
+    """Row without its pictures, and the cameras whose video frame repeats the previous one.
 
-    `lost` are the repeated cameras whose picture exists but is missing in their video.
+    `lost` are those of the `repeated` cameras that did have a new picture, which is missing in their video.
     """
 
     row: Row

@@ -19,15 +19,19 @@ FOLDER = "quarantine"
 class DamageMark:
     """Damage found in a recording.
 
-    `damage` has the form of `IntegrityCheck.to_dict`. `seal` is that of the outcome at that time; "" if the outcome had
-    no seal, None if it is unknown.
+    `damage` has the form of `IntegrityCheck.to_dict`. `seal` is the seal that outcome.json had when the damage was
+    found; "" if it had none, None if that is unknown.
     """
 
     damage: list[dict[str, Any]]
     seal: str | None
 
     def is_resolved_by(self, verdict: IntegrityCheck) -> bool:
-        """Return True if the same recording is intact again; not if it was sealed anew since."""
+        """Return True if the check `verdict` shows that the recording is intact again.
+
+        A recording with another seal than the mark's does not count as intact again, because it was sealed after the
+        damage.
+        """
         if verdict.state == "sound":
             return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
         files = {entry["file"] for entry in self.damage}

@@ -23,10 +23,10 @@ class Picture(NamedTuple):
 
 
 def encode_count(repeats: int) -> int:
-    """Return the number of frames to code for `repeats` repeats in a row; the remaining frames are copies.
+    """Return how many of `repeats` successive repeats must be encoded; the remaining frames are copies of encoded ones.
 
-    A run of copies alternates between two key frames and ends with the second, so if the number is odd, one more repeat
-    is coded before it.
+    Copies alternate between two encoded key frames and come in pairs, so if the number is odd, one more repeat is
+    encoded before them.
     """
     return repeats if repeats < RUN else 2 + repeats % 2
 
@@ -44,10 +44,10 @@ class Pace:
 
 
 class PictureQueue:
-    """Queue that accepts pictures as long as all its content can be coded within `max_lag_s` at the present pace.
+    """Queue that accepts pictures as long as all its content can be encoded within `max_lag_s` at the present pace.
 
-    At most `places` pictures are stored. Repeats are only counted: a run of any length costs at most three codings. An
-    empty queue accepts a picture even if the encoder is too slow.
+    At most `places` pictures are stored. Repeats are only counted: of successive repeats at most three are encoded,
+    whatever their number. An empty queue accepts a picture even if the encoder is too slow.
     """
 
     def __init__(self, places: int, max_lag_s: float = math.inf) -> None:
@@ -62,7 +62,10 @@ class PictureQueue:
         self._closed = False
 
     def put(self, picture: UInt8 | None, patience: float = 0.0, captured: float = math.nan) -> bool:
-        """Queue one frame; return False if it became a repeat because it was not accepted within `patience` [s]."""
+        """Queue one frame; return False if it is queued as a repeat of the previous frame.
+
+        That is so if `picture` is None, or was not accepted within `patience` [s].
+        """
         with self._changed:
             if picture is not None and patience:
                 self._changed.wait_for(lambda: self._held < self._places or self._closed, patience)

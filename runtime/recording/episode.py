@@ -281,7 +281,9 @@ class _Recording:
         self._conclude(outcome, stuck)
 
     def _report_losses(self) -> None:
-        """Report a full disk as a fault for encoders that dropped pictures, even if the disk has room again."""
+        """Report an error for each encoder that dropped pictures because the disk was full, even if there is room
+        again.
+        """
         for encoder in self._encoders.values():
             if isinstance(encoder.failure, DiskFullError):
                 self._faults.report(encoder.failure)

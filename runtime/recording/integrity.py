@@ -37,7 +37,7 @@ class IntegrityCheck:
     """Result of the integrity check of one episode: "sound", "damaged", "unsealed" or "open".
 
     "unsealed" (no digests) means that nothing proves whether the files are as they were written, "open" that there is
-    no outcome. `seal` is that of the outcome, or of its copy if the outcome is lost; "" if there is neither.
+    no outcome. `seal` is the seal in outcome.json, or in its copy if outcome.json is lost; "" if there is no seal.
     """
 
     path: Path

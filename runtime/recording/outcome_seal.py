@@ -44,7 +44,10 @@ def _counts(path: Path, layout: Layout) -> bool:
 
 
 def seal_outcome(outcome: Mapping[str, object], digests: Mapping[str, FileDigest]) -> bytes:
-    """Return outcome.json with the digests of the files and its own digest, computed with zeros in its place."""
+    """Return the content of outcome.json, with the digests of the files and with a seal.
+
+    The seal is the digest of this content with zeros in place of the seal.
+    """
     whole = {**outcome, COPY: OUTCOME_COPY, DIGESTS: digests, SEAL: _UNSEALED.decode()}
     text = to_json(whole, "the outcome", indent=1)
     # The seal is the last key, so its zeros are the last ones in the text.

@@ -50,7 +50,10 @@ def _mark(data: Path, verdict: IntegrityCheck) -> None:
 
 
 def _remove_mark(data: Path, verdict: IntegrityCheck) -> None:
-    """Remove the mark, after another check because another process may have found damage since `verdict`."""
+    """Check the recording again, and remove its mark if that shows it to be intact.
+
+    The second check is needed because another process may have found damage since `verdict`.
+    """
     path = mark_file(data, verdict.path.name)
     with exclusive(path.parent):
         mark = read_mark(data, verdict.path.name)

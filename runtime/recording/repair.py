@@ -205,7 +205,11 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 
 
 def _unproven(path: Path, closed: bool) -> str:
-    """Return a sentence about the facts that an episode lost if it had been closed; "" without a sign that it was."""
+    """Return a sentence that the episode had been closed before, so that facts of its end are lost.
+
+    "" without a sign of that. Signs are an export of the episode, and, as `closed` states, that all its tables have an
+    end mark.
+    """
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None
     if table is not None and table.exists():

@@ -12,7 +12,11 @@ from runtime.core.types import Observation
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Recorded cameras and vectors; None: all of them. `reported`: actions are those that the node reports."""
+    """Cameras and vectors that an episode records; `cameras` or `columns` None: all of them.
+
+    `required` are the vectors that every row must have. If `reported`, the actions are those that the node reports.
+    `max_skew_s` is the largest permitted spread of capture times [s], None without a limit.
+    """
 
     cameras: tuple[str, ...] | None = None
     columns: tuple[str, ...] | None = None

@@ -84,9 +84,9 @@ def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
 def _compare_digests(
     folder: Path, outcome: Mapping[str, Any], files: Collection[str], second: bool = True
 ) -> IntegrityCheck:
-    """Compare all files, or only `files`, with their digests; return the result.
+    """Compare all files, or only `files`, with the digests in `outcome`; return the result.
 
-    If `second`, the copy of the outcome counts as one of all files.
+    If `second` and all files are compared, the copy of the outcome is checked too.
     """
     manifest = _manifest(folder)
     digests = {name: expected for name, expected in outcome[DIGESTS].items() if not files or name in files}

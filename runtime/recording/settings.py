@@ -82,7 +82,7 @@ class RecordingSettings(Settings):
         return CODECS[self.codec].crf if self.crf is None else self.crf
 
     def chosen_gop(self, fps: float) -> int:
-        """Return the most frames between two key frames at that rate [Hz]."""
+        """Return the largest number of frames from one key frame to the next, for a video of `fps` [Hz]."""
         return self.gop or max(1, min(_GOP, int(_GOP_SECONDS * fps)))
 
     def sizes(self, cameras: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:

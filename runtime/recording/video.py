@@ -134,7 +134,10 @@ class FragmentedVideo:
         return packets
 
     def _copy(self, pair: list[Any], count: int) -> None:
-        """Mux `count` (even) copies of two key frames; the frame after them must not refer to them."""
+        """Append `count` frames, an even number, that are copies of two encoded key frames in turn.
+
+        The next encoded frame is a key frame, because it must not refer to copies.
+        """
         contents = [bytes(packet) for packet in pair]
         for number in range(count):
             packet = av.Packet(contents[number % 2])

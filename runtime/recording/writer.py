@@ -105,8 +105,15 @@ class DiskWriter:
     ) -> bool:
         """Write and sync everything, end the streams, close all files except those in `leave`.
 
-        Return False if that was not finished by `deadline` (time.monotonic). If the disk is full, `full` is set, the
-        files stay open, and `save` tries again. `others` are further functions that write at the end.
+        If the disk is full, `full` is set and the files stay open; `save` then tries again.
+
+        Args:
+            deadline: Longest wait, as a time of time.monotonic.
+            leave: Files that stay open.
+            others: Further functions that the thread calls to write at the end.
+
+        Returns:
+            True if the thread has ended by the deadline.
         """
         self._left, self._others = leave, others
         self._closing.set()

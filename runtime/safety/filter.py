@@ -288,7 +288,7 @@ class SafetyFilter:
     def _catch_up_velocity(
         self, requested: Float64, action: Float64, state: RobotState, path: Path
     ) -> Float64:
-        """Return `wanted` velocities, reduced where the command is behind its target so that it does not overshoot.
+        """Return the `requested` velocities, reduced for joints that lag behind their target.
 
         After a jump of the target, the command must not arrive with all the speed gathered on the way: its speed
         relative to the target is limited to one that can still be braked within the remaining distance.

@@ -111,9 +111,9 @@ class CommandGate:
         return message
 
     def _rules(self, message: dict[Any, Any], arrival: float) -> bool:
-        """Return True if the sender is the master or becomes it.
+        """Return True if the sender of a message is the master or becomes it.
 
-        The first sender is the master until it has been silent for MASTER_SILENCE.
+        Another sender becomes the master only after the present one has been silent for MASTER_SILENCE.
         """
         name = message.get("master")
         name = name if isinstance(name, str) else ANONYMOUS

@@ -53,7 +53,10 @@ class SimulatedLeader:
         self._asked = float("-inf")
 
     def update(self, observation: Observation, now: float) -> None:
-        """Let the script answer the observation at time `now` [s], if it did not within the last _ASKS_S seconds."""
+        """Pass the observation at time `now` [s] to the script, and follow the rows that it returns from now on.
+
+        Do nothing if the previous observation was passed to it less than _ASKS_S seconds ago.
+        """
         if now - self._asked < _ASKS_S:
             return
         q = np.asarray(observation.qpos, np.float64)
@@ -102,10 +105,10 @@ class AttachedLeader(Leader):
 def demonstrator(
     robot: Robot, task: str, seed: int, behaviour: str = "pick_place", start: str = "home"
 ) -> SimulatedLeader:
-    """Return a simulated leader that performs `task` by the script that `behaviour` names.
+    """Return a simulated leader that performs `task`.
 
-    That is "pick_place", or any other name for a gesture. Before the first observation the leader is at the pose
-    `start`.
+    If `behaviour` is "pick_place", it follows the pick-and-place script; with any other name it makes a gesture. Before
+    the first observation the leader is at the pose `start`.
 
     Raises:
         SetupError: If the robot has no such pose, or no arm of it can pick objects up.

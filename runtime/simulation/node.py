@@ -52,8 +52,8 @@ class Ticking(Protocol):
 class Node:
     """Simulated node of one robot with two sockets; call `open`, then `tick` at the rate, then `close`.
 
-    To exchange messages without sockets, call `exchange` instead. `around` is used instead of the environment that the
-    options name.
+    To exchange messages without sockets, call `exchange` instead. If `around` is given, the robot is in this
+    environment instead of the one that the options name.
 
     Raises:
         SetupError: If a camera or pose in the options does not exist.

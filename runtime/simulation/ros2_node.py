@@ -110,7 +110,7 @@ class Ros2Node(RosRobot):
     def _reader(self, topic: str) -> Any:
         """Return a reader of commands with the default QoS of ROS 2 drivers.
 
-        It is reliable, so that a best-effort publisher of commands is not connected.
+        The reader is reliable. As with real drivers, it therefore receives nothing from a best-effort publisher.
         """
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.sub import DataReader

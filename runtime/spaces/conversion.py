@@ -125,10 +125,11 @@ class ActionSpaces(EndEffectors):
     def _snap_grippers(
         self, rows: Float64, columns: Mapping[int, int], onset: ChunkStart, rate: float
     ) -> list[int]:
-        """Snap the binary grippers in `rows` [H, W] in place; return their columns, which `columns` has by dimension.
+        """Snap the binary grippers in `rows` [H, W] in place; return their columns.
 
-        The hysteresis starts from the present command twice: at row 0, and at the first row that will be executed,
-        because that row follows the present command and not the rows before it.
+        `columns` maps a dimension of the robot's vector to its column in the rows. The hysteresis starts from the
+        present command twice: at row 0, and at the first row that will be executed, because that row follows the
+        present command and not the rows before it.
         """
         first = int(onset.first_row * rate / self._control_rate + 1e-9)
         snapped = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
@@ -206,8 +207,9 @@ class ActionSpaces(EndEffectors):
         return layout.normalize_quaternions(vectors, f"the chunk is {chunk.mode} to an observation with")
 
     def _with_joints(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
-        """Return `qpos` [D] repeated for each row, with its values replaced by `joints` that follow the poses:
-        [H, D].
+        """Return vectors of the whole robot [H, D]: `qpos` [D] with some joints replaced.
+
+        The joints that follow the poses in a row are taken from `joints` [H, n].
         """
         full = np.tile(qpos, (len(joints), 1))
         full[:, layout.dims] = joints

@@ -123,7 +123,7 @@ class CameraServer(ABC):
 
     @abstractmethod
     def _speak(self, client: socket.socket) -> None:
-        """Serve one client until either side ends the connection.
+        """Send images to one client until either side ends the connection.
 
         Raises:
             OSError: If the connection is lost.

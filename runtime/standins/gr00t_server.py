@@ -145,9 +145,9 @@ class Gr00tServer:
         return self._behaviour.version.startswith("n1.7")
 
     def _spoilt_frames(self) -> Sequence[bytes] | None:
-        """Return the frames that the fault sends instead of the answer; `_RIGHT` if the right answer is to be sent.
+        """Return the frames that the fault sends in place of the right answer; None if the fault sends nothing.
 
-        None if nothing is to be sent.
+        If the fault does not affect this answer, return `_RIGHT`: the right answer is then sent.
         """
         fault, number = self._behaviour.fault, self._asked
         self._asked += 1
@@ -187,9 +187,7 @@ class Gr00tServer:
         return self._action(message["data"])
 
     def _contract(self) -> dict[str, object]:
-        """Return what a StarVLA server states: state and action keys with prefix and number of dimensions; no
-        images.
-        """
+        """Return the reply of a StarVLA server: state and action keys with prefix and width, without images."""
         groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
         actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
         contract: dict[str, object] = {"unnorm_key": "stand_in"}

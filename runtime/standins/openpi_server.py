@@ -70,7 +70,7 @@ class OpenpiServer(WebsocketServer):
         return _Conversation(self, self._script.begin())
 
     def on_answered(self, answer: Answering, seconds: float) -> None:
-        """Store the duration of `answer`, which the next answer on its connection reports."""
+        """Store how long the answer took; the next answer on the same connection reports it."""
         assert isinstance(answer, _Conversation)
         answer.previous_ms = 1e3 * seconds
 

@@ -47,7 +47,7 @@ class Wire(ABC):
 
     @abstractmethod
     def read(self, message: Any) -> ParsedRequest:
-        """Parse a request; an invalid request raises an exception that depends on the mistake."""
+        """Parse a request. Raises an exception, whose type depends on the mistake, if the request is invalid."""
 
     @abstractmethod
     def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:

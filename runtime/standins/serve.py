@@ -238,7 +238,7 @@ def _rtc(options: argparse.Namespace) -> Name:
 
 
 def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespace) -> Script:
-    """Return the script, converted to poses if the options request that."""
+    """Return the script, wrapped so that it answers in poses if the options request that."""
     if options.space == "joint":
         if options.pose:
             raise SetupError(f"--pose {' '.join(options.pose)}: allowed with --space eef")

@@ -114,7 +114,7 @@ class WebsocketServer(ABC):
                     return
 
     def on_answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
-        """Handle the fact that a reply was sent `seconds` [s] after its request; the default does nothing.
+        """Do something after a reply was sent, `seconds` [s] after its request; the default does nothing.
 
         `answer` is the function that answers the requests of the connection.
         """

@@ -156,7 +156,10 @@ class DatasetSource(Source):
         return self._clock.now() + TOLERANCE >= due
 
     def _prefetch(self, row: int) -> None:
-        """Decode the pictures of `row` while waiting for its due time, when errors in them are reported."""
+        """Decode the pictures of `row` before it is due.
+
+        Errors are ignored here: they are raised when the row is due and its pictures are decoded again.
+        """
         with suppress(RecordingError):
             self._decode(row)
 

@@ -23,8 +23,9 @@ class FrozenCameraDetector:
         self._frozen: set[str] = set()
 
     def captured(self, pictures: Mapping[str, UInt8], time: float) -> dict[str, float]:
-        """Return by camera when its picture first appeared: `time`, or earlier if the picture equals the
-        previous one.
+        """Return for each camera the time at which its present picture first appeared.
+
+        That is `time`, or earlier if the picture equals the previous one.
         """
         times = {}
         for camera, picture in pictures.items():

@@ -324,10 +324,9 @@ class NodeSource(Source):
         return times
 
     def _mapped(self, stamp: float, arrived: float) -> float | None:
-        """Return the node's stamp on our clock, or None if it is older than an earlier stamp, because time never goes
-        back.
+        """Return the node's stamp on our clock; None if it is older than an earlier stamp.
 
-        If the node's clock jumps, the jump is counted and the map starts anew.
+        If the node's clock jumps, the jump is counted, the map starts anew, and the stamp is accepted.
         """
         restarts, leaps = self._map.restarts, self._map.leaps
         time = self._map.map(stamp, arrived)

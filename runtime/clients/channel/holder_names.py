@@ -40,10 +40,11 @@ class HolderNames:
     def is_alive(self, connection: bytes, message: Message, stops: bool) -> bool:
         """Return True if the message shows that its holder is alive; `stops`: the message is a stop.
 
-        If all scripts are one holder, a script that only watches must not keep alive the command of another script. A
-        query therefore counts only on a connection that has sent a command, if it asks for the result of a command, or
-        if it is the first message of a connection and asks for the status: clients that reconnect for each call wait
-        like that.
+        A script that has a name or a connection of its own is alive with every message. If all scripts are one holder,
+        a script that only asks for the status must not extend the lease of a script that commands. A query then counts
+        only if its connection has sent a command before, if it asks for the result of a command, or if it asks for the
+        status as the first message of its connection: clients that reconnect for each call wait for the end of a
+        command in this way.
         """
         if self._apart or message.client:
             return True

@@ -13,7 +13,7 @@ from runtime.core.errors import TransportError
 
 @dataclass(slots=True)
 class ScriptSelection:
-    """Choices of one script. If a value is None or empty, the deployment's value applies."""
+    """Values that one script has chosen for set-ups and runs. If a value is None or empty, the deployment's applies."""
 
     task: str | None = None
     collect_task: str | None = None

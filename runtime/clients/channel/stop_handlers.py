@@ -33,7 +33,10 @@ def is_estop(message: Message) -> bool:
 
 
 class StopHandler:
-    """Handler of stops at the coordinator; it uses the lease of the script of this channel that holds it."""
+    """Handler of stops, which go to the coordinator.
+
+    A stop is sent under the lease of whichever script of this channel holds it.
+    """
 
     def __init__(
         self, open_client: Callable[[str], StationClient], lives: ScriptActivity, outcomes: Outcomes
@@ -55,9 +58,9 @@ class StopHandler:
         return json_answers.command_answer(message, outcome, {}, state)
 
     def _stop(self, holder: str, kind: str) -> str:
-        """Send the stop under the lease that a script of the channel holds, else under a lease of the sender.
+        """Send the stop and return the station's state after it.
 
-        Return the state after it.
+        If another script of the channel holds the lease, the stop is sent in its name, otherwise in that of the sender.
         """
         client = self._open(holder)
         try:

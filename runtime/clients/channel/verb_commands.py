@@ -21,9 +21,10 @@ class UnsupportedVerb(RuntimeFault):
 
 @dataclass(frozen=True, slots=True)
 class CommandSequence:
-    """Commands to send in order, none if the verb requires no action of the station; the last command's result counts.
+    """Commands to send in order; empty if the verb requires no action of the station. The last command's result counts.
 
-    `chosen` is recorded after they were accepted; `told` are further keys of the answer, `note` is its reason.
+    `chosen` are choices that are recorded after all commands were accepted. `told` are further keys of the answer, and
+    `note` is the reason in the answer.
     """
 
     steps: tuple[Step, ...] = ()

@@ -188,7 +188,10 @@ def _reason(snapshot: Mapping[str, Any]) -> str:
 
 
 def _open(sentence: Any) -> bool:
-    """Return True if a sentence, and all sentences in its arguments, are of kinds that the panel may display."""
+    """Return True if the panel may display a sentence.
+
+    The kinds of the sentence and of all sentences in its arguments must be permitted.
+    """
     if not isinstance(sentence, Mapping) or str(sentence.get("id")).split(".")[0] not in _SHOWN:
         return False
     within = sentence.get("arguments") or {}

@@ -37,11 +37,12 @@ _SHORTEST = 1e-12  # square of the shortest valid quaternion
 
 
 def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
-    """Return the type of an arm with `moving` joints driven by `size` numbers, on a carrier of `carrying` joints.
+    """Return the type of an arm's record.
 
-    Of the numbers the first `joints` are the arm's own, at the indices `dims` of the robot's vector, within `lower` and
-    `upper`, not faster than `speed`; the rest is padding at 0. A limit repels a joint that is nearer to it than `below`
-    (for `lower`) or `above` (for `upper`).
+    The arm has a chain of `moving` joints that `size` driving numbers move, on a carrier of `carrying` joints. The
+    first `joints` of the driving numbers are the arm's own: `dims` are their indices in the robot's vector, `lower` and
+    `upper` their limits, `speed` their velocity limits; all further numbers are padding and 0. A limit repels a joint
+    that is nearer to it than `below` (for `lower`) or `above` (for `upper`).
     """
     return np.dtype(
         [
@@ -179,9 +180,9 @@ def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
 def _set_start(going: bool, frame: Record) -> None:
     """Set the start of a frame's search and its rest position.
 
-    If the previous frame reached its target, the start is a full extrapolation of its motion, and the rest position
-    most of one: on a smooth path one iteration then suffices, and where branches meet (a singularity) the motion
-    continues straight.
+    If `going`, i.e. the previous frame reached its target, the motion is extrapolated: fully for the start, and mostly
+    for the rest position. On a smooth path one iteration then suffices, and at a singularity, where solution branches
+    meet, the motion continues straight.
     """
     for i in range(len(frame.q)):
         begin = min(max(frame.q[i], frame.lower[i]), frame.upper[i])

@@ -1,7 +1,8 @@
 """Forward kinematics and Jacobian of a chain.
 
 Chains are records of chain_type: every joint turns about, or slides along, the z axis of its own frame. Frames are
-twelve numbers: a rotation row by row, then the origin. `reach` is a record of fk_buffer_type, a scratch buffer.
+twelve numbers: a rotation row by row, then the origin. Arguments named `reach` are scratch buffers, records of
+fk_buffer_type.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def _set_quadratic(rest: float, frame: Record) -> None:
 
 @device_function
 def _predicted_decrease(box: Record) -> float:
-    """Return by how much the step lowers the cost according to the undamped quadratic."""
+    """Return the decrease of the cost that the quadratic problem without damping predicts for the step."""
     total = 0.0
     for i in range(len(box.step)):
         across = 2 * box.gradient[i] + box.system[i, i] * box.step[i]

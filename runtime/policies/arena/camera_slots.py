@@ -59,7 +59,7 @@ class Cameras:
 
 
 def _keys(wants: ServerRequirements, numbering: Numbering) -> list[tuple[Slot, str]]:
-    """Return slots and request keys in the order of the protocol's messages."""
+    """Return (slot, request key) for each picture that the server needs, in the order of the protocol's messages."""
     slots: tuple[Slot, Slot] = ("first", "second")
     stereo: tuple[Slot, Slot] = ("first_stereo", "second_stereo")
     keys: list[tuple[Slot, str]] = []

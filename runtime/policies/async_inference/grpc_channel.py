@@ -27,10 +27,11 @@ _LARGEST_MESSAGE = 4 * 1024 * 1024  # [bytes]; largest message that the server a
 
 
 class Channel:
-    """gRPC channel that can be opened again until it is aborted; `abort` is for any thread, the rest for one at a time.
+    """gRPC channel that can be opened again until it is aborted.
 
-    Responses of more than `limit` bytes are refused. `dial` returns the host and port to connect to, if they differ
-    from those of the url. Raises ConfigurationError if gRPC is not installed.
+    `abort` may be called by any thread, all other methods by one thread at a time. Responses of more than `limit` bytes
+    are refused. `dial` returns the host and port to connect to, if they differ from those of the url. Raises
+    ConfigurationError if gRPC is not installed.
     """
 
     def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:

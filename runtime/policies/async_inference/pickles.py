@@ -1,8 +1,9 @@
-"""Pickles of LeRobot's policy server, without LeRobot and without executing anything of the peer.
+"""Pickles of LeRobot's policy server, without LeRobot and without executing code of the peer.
 
-Instances of the server's classes are written, whose names are all that the pickle needs. Lists of its TimedAction are
-read: only the pickle instructions that these need exist here, names are looked up in a table of this module, and every
-other name is refused. Source: lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
+To write an instance of one of the server's classes, a pickle needs only the name of the class, so that LeRobot need not
+be installed. The only objects read are lists of the server's TimedAction: the interpreter has only the pickle
+instructions that these need, and refuses every name that is not in a table of this module. Source:
+lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def load_actions(data: bytes, limit: int) -> list[TimedAction]:
 
 
 class _Writer(pickle._Pickler):
-    """Python's pickler, except that our classes are written by their names in the server's module."""
+    """Python's pickler, except that it writes the classes of this module as classes of the server's module `module`."""
 
     save: Callable[[Any], None]  # of Python's pickler, like the next two
     write: Callable[[bytes], None]
@@ -108,7 +109,10 @@ class _Record:
 
 
 class _Name:
-    """Class or function that a pickle names, with our function that is called instead; its attributes are read-only."""
+    """Class or function that a pickle names; its attributes are read-only.
+
+    `make` is the function of ours that is called in its place, None if calling it is refused.
+    """
 
     __slots__ = ("make", "what")
     what: str
@@ -131,7 +135,7 @@ _NEEDED = (
 
 
 class Reader(pickle._Unpickler):
-    """Pickle interpreter with instructions for plain data only; every name is refused."""
+    """Pickle interpreter with instructions for plain data only; a pickle that names a class or function is refused."""
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = {
         code: pickle._Unpickler.dispatch[code] for code in (getattr(pickle, name)[0] for name in _NEEDED)
@@ -142,7 +146,10 @@ class Reader(pickle._Unpickler):
 
 
 class _Reader(Reader):
-    """Pickle interpreter for one list of TimedAction; only the names that such a list needs are accepted."""
+    """Pickle interpreter for one list of TimedAction.
+
+    It accepts only the classes and functions that such a list names.
+    """
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(Reader.dispatch)
     stack: list[Any]  # of Python's unpickler, like the next one

@@ -37,10 +37,10 @@ Array = np.ndarray[Any, Any]
 
 
 class Tensors:
-    """Tensors of one message; storages are cached by their bytes, because a server sends the same storage with each
-    row.
+    """Tensors of one message.
 
-    `reader` is a pickle interpreter for plain data.
+    Storages are cached by their bytes, because a server sends the same storage with each row. `reader` is a class of
+    pickle interpreters for plain data.
     """
 
     def __init__(self, reader: type[Any]) -> None:

@@ -32,8 +32,8 @@ class ActionFormat:
 class Modality:
     """Keys of one modality, without their prefix, and their time steps relative to the newest observation.
 
-    `keys` is None if the server does not list them. By key, as far as the server states them: `written` is the format
-    of an action, `widths` the number of its values.
+    `keys` is None if the server does not list them. `written` maps keys of actions to their formats, and `widths` maps
+    keys to their numbers of values; both have only the keys for which the server states this.
     """
 
     keys: tuple[str, ...] | None = ()
@@ -106,7 +106,7 @@ def _contract(contract: Mapping[str, Any]) -> Modalities:
 
 
 def _flat(contract: Mapping[str, Any], name: Name) -> tuple[str, ...] | None:
-    """Return the keys of a modality without their prefix; None if it has none, because the model does not use it."""
+    """Return the keys of a modality without their prefix; None if the contract lists no keys for it."""
     keys = contract.get(f"{name}_keys", [])
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise WrongProtocolError(f"the server has {name}_keys {_short(keys)}; expected a list of names")
@@ -155,8 +155,9 @@ def _modality(entry: Mapping[str, Any], name: Name) -> Modality:
 
 
 def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
-    """Return the formats by key; {} unless `configs` has one per key, because some servers list a wrong number
-    harmlessly.
+    """Return the format of each action key; {} unless `configs` is a list with one entry per key.
+
+    A list of another length is no error, because some servers send one and work.
     """
     if not isinstance(configs, list) or len(configs) != len(keys):
         return {}

@@ -137,9 +137,9 @@ class Gr00tRequest:
         return ModelInput(observation.step, pictures, inputs["state"])
 
     def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
-        """Return the arguments of get_action for the newest input `moment` and the stored inputs before it.
+        """Return the arguments of get_action for `prompt` and the newest input `moment`.
 
-        `moment` is stored as long as later requests need it.
+        They include earlier inputs if the model needs them. `moment` is stored as long as later requests need it.
         """
         modalities = self._wanted
         assert modalities is not None, "configure comes first"
@@ -308,7 +308,7 @@ def _check_steps(name: str, modality: Modality, history: str) -> None:
 def _check_written(key: str, written: ActionFormat | None, settings: RequestSettings) -> None:
     """Check that the server's format of an action agrees with the deployment.
 
-    Poses could be mistaken for joints, or changes for targets. Raises ActionSpaceError.
+    Otherwise poses could be taken for joints, or changes for absolute targets. Raises ActionSpaceError.
     """
     if written is None:
         return

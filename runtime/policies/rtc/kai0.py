@@ -24,7 +24,7 @@ _COLUMNS = 32  # width of the model: rows are padded with zeros or cropped
 class Kai0(Dialect):
     """Dialect whose keys are in every request, except `prev_action_chunk`, which needs a previous chunk.
 
-    The server ignores the last three keys.
+    The server ignores `enable_rtc`, `mask_prefix_delay` and `max_guidance_weight`.
     """
 
     continues_model_rows = False

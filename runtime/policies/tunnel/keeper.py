@@ -86,7 +86,11 @@ class TunnelKeeper:
             return self.status
 
     def poll(self) -> None:
-        """Start ssh if it is due, check whether its port listens, or discard it if it has ended or is late."""
+        """Advance the tunnel by one step.
+
+        Start ssh if it is due; set the status to up as soon as its port listens; discard ssh if it has ended or does
+        not listen in time.
+        """
         now, ssh = self._now(), self._ssh
         if ssh is None:
             if not self._back_off.remaining_delay(now):
@@ -129,7 +133,11 @@ class TunnelKeeper:
             self._set_status(refusals=self.status.refusals + new, refusal=ssh.refusal)
 
     def _discard(self, ssh: Ssh, reason: str) -> None:
-        """End this ssh and record the failure; if only its port was taken, a new start follows at once."""
+        """End this ssh and record the failure.
+
+        If another process has taken its local port, that does not count as a failure, and ssh is started again at once,
+        a limited number of times.
+        """
         port_taken = not self.status.up and port_was_taken(ssh.said)
         self.stop()
         if port_taken and self._taken < _PORTS:

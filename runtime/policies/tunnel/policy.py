@@ -121,9 +121,9 @@ class TunnelledPolicy(Policy):
         return Ssh(command(self._ssh, self._settings, port, self._far), port, self._settings.session)
 
     def _local_address(self) -> Place:
-        """Return host and port of the tunnel's local end.
+        """Return host and port of the tunnel's local end. Raises TunnelError while the tunnel is down.
 
-        Its owner is checked at each call, because another process may have taken a former port of ours.
+        Each call checks that the present ssh owns the port: after ssh has ended, another process may take it.
         """
         keeper = self._keeper
         if keeper is None:

@@ -61,7 +61,10 @@ class TickSettings:
 
 
 class TickResult(NamedTuple):
-    """Result of one tick: its target, and the action that was sent, float64 [D]; None if nothing was sent."""
+    """Result of one tick: `target` is the behaviour's target, `executed` float64 [D] the action that was sent.
+
+    Each is None if there was none.
+    """
 
     time: float  # our monotonic clock [s]
     target: Target | None = None
@@ -199,7 +202,7 @@ class Actuator(ABC):
         return False
 
     def _checked(self, action: Float64, elapsed: float, stop: bool) -> LimitedCommand:
-        """Return `action` after the checks of measurements: unchanged, because this robot is not measured."""
+        """Return `action` unchanged; subclasses with a measured robot check it against the measurements."""
         return LimitedCommand(action)
 
 

@@ -43,7 +43,7 @@ _ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person requests each ch
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """Merge half of a strategy, with its kind."""
+    """Part of a strategy that merges chunks into the plan, with the strategy's kind."""
 
     kind: str
     merge: Merge
@@ -109,7 +109,9 @@ class ExecuteChunks(Behaviour):
         return Target(planned.action, self._source, "policy", planned.contributions)
 
     def ran_on(self, step: int, commanded: Float64) -> bool:
-        """Return True if the plan for `step` has moved away from `commanded` [D], where the robot stopped."""
+        """Return True if the plan for `step` has moved away from `commanded` [D], the command at which the robot
+        stopped.
+        """
         planned = self.timeline.at(step)
         if planned is None:
             return False
@@ -131,10 +133,11 @@ class ExecuteChunks(Behaviour):
         self._strategy, self._useless = chosen, False
 
     def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
-        """Merge a chunk into the plan from `step` (first step not yet sent) on; `commanded` [D] was sent last.
+        """Merge a chunk into the plan from `step` on, the first step not sent yet.
 
-        The wait for the first chunk ends even if the chunk is dropped. If the robot was stopped while a dropped chunk
-        was requested, that wait ends too. So a policy whose chunks are all dropped starves the run.
+        `commanded` [D] is the newest command. After this call the run no longer waits for its first chunk, even if this
+        chunk was dropped. If the dropped chunk was requested while the robot was stopped, an empty plan no longer
+        counts as waiting either. So a policy whose chunks are all dropped starves the run.
         """
         try:
             joined = self._join(chunk, step, commanded)
@@ -192,9 +195,10 @@ class ExecuteChunks(Behaviour):
         )
 
     def _first_used_distance(self, arrival: ArrivedChunk, step: int, commanded: Float64) -> tuple[float, str]:
-        """Return how far the first row of a chunk that is not stale is from `commanded` [rad], and describe it.
+        """Return how far the first row of a chunk that would be used is from `commanded` [rad], and a description.
 
-        0 and "" unless the chunk is the first of the run.
+        Rows for past steps are not used. Return 0 and "" if the chunk is not the first of the run, or none of its rows
+        would be used.
         """
         if not self._expecting:
             return 0.0, ""
@@ -215,9 +219,9 @@ class ExecuteChunks(Behaviour):
         return worst, _FIRST_ACTION_FAR(joint=name, distance=worst)
 
     def bear(self, until: float) -> None:
-        """Tolerate that nothing is planned until `until`, because requests to a lost policy are being retried.
+        """Tolerate until time `until` that no action is planned, because requests to a lost policy are being retried.
 
-        Within one gap without planned actions only the first loss of the policy is tolerated.
+        Within one gap without planned actions only the first call has an effect.
         """
         if self._starved_since is None or self.borne_until < self._starved_since:
             self.borne_until = until

@@ -272,7 +272,11 @@ class CommandPipeline:
         return reachable
 
     def _apply_locks(self, action: Float64, planned: float) -> tuple[Float64, tuple[str, ...]]:
-        """Return `action` [D] with locked, snapped and dwelling grippers, and notes on the changes."""
+        """Return `action` [D] with the permitted gripper values, and notes on the changes.
+
+        Locked grippers are held at their locks, binary grippers are snapped to open or closed, and those that switched
+        too recently do not switch.
+        """
         commanded = self.actuator.commanded
         action, locked = self._locks.apply(action)
         action = snap_grippers(self._settings.switches, action, commanded)
@@ -339,7 +343,7 @@ class CommandPipeline:
     def _check_joints_returned(
         self, run: ExecuteChunks, step: int, planned: float, observation: LatestObservation
     ) -> None:
-        """Discard the plan if the joints are back after a short gap, but the plan went on without the robot."""
+        """Discard the plan if joints are measured again after a gap in which it moved on without the robot."""
         state = self.actuator.state(observation, planned, None)
         if (
             not self._safety.unseen(state)
@@ -395,9 +399,9 @@ class CommandPipeline:
         return self._send_hold(step, planned, target, observation)._replace(target=None)
 
     def _braking_hold(self) -> Hold:
-        """Return the braking motion that replaces a missing or refused action; start one if none is active.
+        """Return the braking motion that replaces missing or refused actions; start one if none is active.
 
-        `hold()` continues it.
+        If the pipeline then holds, this motion continues.
         """
         if self._standing is None:
             self._standing = self._new_hold()

@@ -148,7 +148,10 @@ class DisplacementMonitor:
         return np.where(self._distrusted, robot.commanded, measured)
 
     def update_target(self, robot: RobotActuator, measured: Float64) -> None:
-        """Record that the command is about to move to `measured` [D]; distrust joints that it followed before."""
+        """Record that the command is about to move to `measured` [D].
+
+        Joints that are displaced again after the command has already followed them are distrusted from now on.
+        """
         where = self.substitute_untrusted(robot, measured)
         away = self._angles & (np.abs(where - robot.commanded) > self._settings.safety.sagged)
         off = away & self._followed
@@ -164,9 +167,9 @@ class DisplacementMonitor:
         )
 
     def reason(self, robot: RobotActuator, measured: Float64 | None) -> str:
-        """Return why no motion may begin from the commanded position, "" if it may.
+        """Return a message if a joint is too far from its command for a motion to begin, "" if a motion may begin.
 
-        `measured` [D] is None if unknown.
+        `measured` [D] is None if unknown; the result is then "".
         """
         if measured is None or not robot.engaged or not self._settings.checks_measurements:
             return ""
@@ -184,9 +187,10 @@ class DisplacementMonitor:
 
     @property
     def speed(self) -> Float64:
-        """Velocity limit of the convergence [D].
+        """Velocity limit with which the command converges to the measured joints [D].
 
-        Joints that converge without parts have their full limit, all other joints that of generated motions.
+        Joints that converge in one piece, without rests, have their full limit, all other joints that of generated
+        motions.
         """
         whole = False if self._meeting or self._led is None else self._led.whole
         return self._settings.limits.velocity * np.where(
@@ -194,7 +198,10 @@ class DisplacementMonitor:
         )
 
     def converge_to_measured(self) -> None:
-        """Move the hold target to the measured joints, including untrusted ones: the operator has asked for it."""
+        """Move the hold target to all measured joints, and trust all joints again.
+
+        The operator has asked for this.
+        """
         self.trust_all_joints()
         self._meeting = True
 
@@ -218,9 +225,10 @@ class DisplacementMonitor:
         self._led = Led(robot.commanded, measured, speed, now, at_once=at_once, along=self._along)
 
     def _finish(self, robot: RobotActuator) -> None:
-        """End the convergence, and decide for each joint whether its reading may be followed again.
+        """End the convergence, and decide for each joint whether its command may follow its reading again later.
 
-        A joint that was proven to move on its own may be followed again; a joint without a conclusion only a few times.
+        It may if the joint was proven to move independently of the command. If the convergence proved nothing, it may
+        until this has happened _VERDICTS times.
         """
         assert self._led is not None
         verdict = np.where(self._blind, 1, self._led.verdict)

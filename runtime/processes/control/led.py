@@ -56,7 +56,7 @@ class Led:
 
     @property
     def verdict(self) -> np.ndarray:
-        """Number of parts in which each joint moved with the command, less those in which it did not, int [D]."""
+        """Number of parts in which each joint moved with the command, minus the number in which it did not, int [D]."""
         return np.asarray(self.along - self._alone)
 
     @property
@@ -65,7 +65,7 @@ class Led:
         return np.asarray(self.at_once | self.alone)
 
     def end(self, goal: Float64) -> Float64:
-        """Return how far the command may now be moved towards `goal` [D]."""
+        """Return the farthest command [D] towards `goal` [D] that is allowed in the present part."""
         return np.where(self.whole, goal, np.clip(goal, self._from - PART, self._from + PART))
 
     def update(

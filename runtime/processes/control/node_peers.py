@@ -19,9 +19,10 @@ _APART_S = 0.02
 class NodeHandover:
     """Sender of `collect_start` when the robot is yielded to its node, and of `collect_stop` when that ends.
 
-    `tell` sends a control word and returns the reason if it could not, "" if it did; `say` emits that reason as an
-    event, once per word. `before` is True if an earlier control process died while the robot was yielded, which must
-    then be ended.
+    Args:
+        tell: Sends a control word; returns the reason if it could not be sent, else "".
+        say: Emits that reason as an event, once per word.
+        before: True if an earlier control process died while the robot was yielded, so that `collect_stop` is due.
     """
 
     def __init__(

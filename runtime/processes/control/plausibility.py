@@ -336,7 +336,8 @@ class JointPlausibility:
     def _stuck(self, chain: _Chain) -> str:
         """Return a message about a joint that now reads a constant far from its trusted reading, "" if there is none.
 
-        Only joints count whose last digits otherwise never rest.
+        Only joints whose last digits usually change with every sample are checked: a constant reading is normal for all
+        others.
         """
         if self._chain is None or len(chain.samples) < _CONSISTENT:
             return ""
@@ -386,7 +387,10 @@ class JointPlausibility:
 
 
 class TrustingPlausibility(JointPlausibility):
-    """Plausibility check that trusts every sample: if no robot moves, a replayed recording jumps when it restarts."""
+    """Plausibility check that trusts every sample.
+
+    It is used if no robot moves: the joints of a replayed recording jump when it starts again.
+    """
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         if seen.measured:

@@ -30,15 +30,19 @@ class _Sample(NamedTuple):
 
 
 class SteadyError:
-    """Distinction of an arm that sags below its command from an arm that is blocked or moving.
+    """Detector of joints with a steady servo error.
 
-    If the command of a sagging arm followed the measurement, the arm would sink tick by tick. A lasting error is caused
-    by the servo, and is no reason to move the command. An error that has grown within the last second, or arose while
-    the command moved and its joint did not, may be caused by an obstacle.
+    It distinguishes an arm that sags below its command from one that is blocked or moving. If the command of a sagging
+    arm followed the measurement, the arm would sink tick by tick. A lasting error is caused by the servo, and is no
+    reason to move the command. An error that has grown within the last second, or arose while the command moved and its
+    joint did not, may be caused by an obstacle.
     """
 
     def __init__(self, settings: TickSettings, inherited: bool) -> None:
-        """Begin without samples; `inherited`: the present command was sent by an earlier control process."""
+        """Begin without samples.
+
+        `inherited` is True if the present command was sent by an earlier control process.
+        """
         self._settings = settings
         self._samples: deque[_Sample] = deque()
         self._inherited = inherited

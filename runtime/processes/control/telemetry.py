@@ -138,7 +138,10 @@ class Telemetry:
         self._outbox.append(merged)
 
     def add_tick(self, seen: LatestObservation, sent: TickResult, simulated: bool) -> None:
-        """Send the record of the tick to media, if it records; `simulated`: the record is of the simulated robot."""
+        """Count the tick in all monitors, and send its record to media unless media needs none.
+
+        `simulated` is True if the result `sent` is that of the simulated robot.
+        """
         self.limiting.update(sent, self.planned)
         self._note_corrected(sent)
         self.nearing.update(sent, self.planned)

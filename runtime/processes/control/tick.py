@@ -376,8 +376,8 @@ class Tick:
     def _shows_it_now(self, stopped: EStopHold, now: float) -> bool:
         """Return True if the measured joints show where the arm is after the e-stop was pressed.
 
-        If the e-stop is pressed in a gap of the measurements, the last joints are older: the arm has moved on, and
-        would be driven back to them.
+        If the e-stop is pressed while measurements are missing, the newest joints are from before the press. The arm
+        has moved since, and must not be driven back to them.
         """
         captured = self._seen.joints_captured
         return (
@@ -479,7 +479,8 @@ class Tick:
     def _disengage(self, reason: str) -> None:
         """Stop sending commands, and emit `reason`.
 
-        An old target would pull a node that restarted at 0, a new target would pull a joint with a dead encoder.
+        Holding is not possible here: if a node restarted with joints at 0, the old target would pull the robot, and if
+        an encoder died, a target from its reading would.
         """
         self._left_run = self._report.run
         self._report_displaced(reason)

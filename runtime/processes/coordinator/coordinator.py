@@ -56,10 +56,7 @@ class Coordinator(Components):
 
     @property
     def rests(self) -> bool:
-        """Whether nothing is in progress and there is no lease holder.
-
-        Then only messages need to wake the process.
-        """
+        """Whether nothing is in progress and nobody holds the lease, so that only messages need to wake the process."""
         return not (
             self.session.state.meaning.at_work
             or self.setup.active
@@ -162,7 +159,10 @@ class Coordinator(Components):
         self.inference.pending_notes.clear()
 
     def _answer_fault(self, error: RuntimeFault) -> None:
-        """Hold, retry for a while, or end the run, as configured for a failing policy."""
+        """Respond to a failed policy as the deployment configures: hold, retry for a while, or end the run.
+
+        A leader is never retried.
+        """
         faults, lost = self.spec.deployment.faults, isinstance(error, PolicyLostError)
         answer = faults.policy_lost if lost else faults.policy_error
         if self.spec.collecting:  # a leader is not retried: its operator must arm again

@@ -86,7 +86,10 @@ DISARMING = frozenset(
 
 
 class Demonstrations:
-    """Demonstrations of a station; `armed` is a person's permission to begin the next one."""
+    """Demonstrations of a station.
+
+    `armed` is True if a person has permitted the next demonstration to begin.
+    """
 
     def __init__(
         self,
@@ -195,7 +198,10 @@ class Demonstrations:
         return None
 
     def _update_first_goal(self) -> None:
-        """Update the first action of the set-up, because the leader moves."""
+        """Give the set-up the pose to which the robot must move before it follows the leader.
+
+        The pose changes as the leader moves.
+        """
         relay = self._relay
         if relay is not None:
             qpos = np.array(self._shared_state.observation.read()["qpos"], np.float64)
@@ -353,7 +359,11 @@ class Demonstrations:
         }
 
     def _fingerprint(self) -> dict[str, Any] | None:
-        """Return the next episode's fingerprint, with the keys of its manifest; None before all pictures arrived."""
+        """Return the robot, cameras, rate and streams that the next episode will record.
+
+        The keys are those of the manifest. If a camera has sent no picture yet, return the previous result, None if
+        there is none.
+        """
         assert self._settings is not None
         record, robot = self._shared_state.observation.read(), self._plan.robot
         described = self._settings.manifest_entry(self._plan.cameras)

@@ -86,7 +86,14 @@ class HealthMonitor:
     ) -> None:
         """Begin to monitor.
 
-        `stoppable` returns whether a person at the robot can stop the run, because the station's panel is served.
+        Args:
+            spec: Specification of the station.
+            shared: Shared state of the station's processes.
+            lease: Lease to monitor.
+            clock: Clock of the runtime.
+            people: Clock of leases.
+            reception: Returns the latest report of reception.
+            stoppable: Returns True if a person at the robot can stop the run, because the station's panel is served.
         """
         self._plan = spec
         self._shared_state = shared
@@ -215,10 +222,10 @@ class HealthMonitor:
         self._lease_held = is_held
 
     def _goes_on_to(self, going: Run | None) -> float | None:
-        """Return the duration [s] to which the run continues although its lease holder is lost.
+        """Return the duration [s] up to which a run continues although its lease holder was lost.
 
-        None if the run is held, or has no limit of duration. Only a trial that has begun continues, and only if it can
-        be stopped at the station's panel.
+        None if it does not continue. Only a trial that has begun and has a limit of duration continues, and only if it
+        can be stopped at the station's panel and the deployment does not demand a hold.
         """
         if self._plan.deployment.lease.lost == "hold" or not self._lease.lost(self._people.now()):
             return None

@@ -314,7 +314,7 @@ class SessionActions:
     def approach(self) -> None:
         """Move on a limited path to the policy's first action.
 
-        It is that of the last set-up, or during a run that of the proposal.
+        During a run that is the start of the proposal, otherwise the first action that the last set-up found.
         """
         proposal, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and proposal is not None:

@@ -92,7 +92,7 @@ class PreflightService:
     def _require_free(self, request: PreflightRequest) -> None:
         """Raise RuntimeFault if the station is at work.
 
-        Also if it is ready, and the preflight would take its exclusive policy server away.
+        Also if it is ready, and the preflight would use its exclusive policy server.
         """
         state = self._state()
         if state.meaning.at_work:
@@ -115,9 +115,9 @@ class PreflightService:
         return self._preflights.report(read("preflight_report", PreflightReportRequest, command.args).id)
 
     def _server(self, command: Command) -> dict[str, Any]:
-        """Return the server's address and the session's state.
+        """Return the address of a policy's server, and the session's state.
 
-        It is the server of the policy in force, or of the policy in the query, as a preflight with it would use.
+        The policy is the one in the query if it has one, otherwise the one in force.
         """
         request = read("policy_server", PolicyServerRequest, command.args)
         settings = self._in_force().deployment

@@ -93,9 +93,10 @@ class CommandService:
         self._endpoints.write("coordinator", where)
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for a command; answer all stops and a share of the rest; publish what is due.
+        """Wait up to `timeout` [s] for a command, then answer commands and publish what is due.
 
-        A new subscriber, and a message of another process, end the wait too.
+        All stops that have arrived are answered, and a limited number of other commands. A new subscriber, and a
+        message of another process, end the wait too.
         """
         if not self._turns.has_waiting:
             self._poller.poll(math.ceil(timeout * 1000))
@@ -131,9 +132,9 @@ class CommandService:
         return authenticate(command, call.payload, call.signature, call.uid, self._key)
 
     def _stop(self, stops: list[QueuedCommand]) -> list[Answered]:
-        """Answer stops without waiting for the disk; return the new answers.
+        """Answer stops without waiting for the disk; return those that were not answered before, with their answers.
 
-        Equal stops in this turn get the same answer.
+        Stops of the same kind, sender and lease in this turn are executed once and get the same answer.
         """
         first: dict[tuple[str, str, str, int], Ack] = {}
         fresh: list[Answered] = []

@@ -339,7 +339,7 @@ class Runs:
     def on_process_restarted(self, process: str, reason: str) -> None:
         """End a standalone recording if media or control was restarted.
 
-        Media had its open files, control its ticks.
+        Its files were open in media, and control produced the ticks that it records.
         """
         if process == "media":
             self._alone = ""  # repair closes it

@@ -225,9 +225,9 @@ class EStopServer:
 
 
 def _arguments() -> argparse.Namespace:
-    """Parse the supervisor's arguments, which are plain values.
+    """Parse the supervisor's arguments.
 
-    So the guard does not load any module that is named in a deployment.
+    They are plain values, so that the guard need not load modules that a deployment names.
     """
     parser = argparse.ArgumentParser(prog="runtime.guard", description="started by the supervisor")
     parser.add_argument("--station", required=True)

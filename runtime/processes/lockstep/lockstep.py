@@ -70,7 +70,7 @@ class Peers:
 class Lockstep:
     """Station without processes; each `tick` runs reception, media, coordinator and control in that order.
 
-    Other code that takes part passes `clock`, its environment `around`, and `peers`.
+    Pass the clock, the environment `around` and `peers` to let other code, for example a simulator, take part.
     """
 
     def __init__(

@@ -63,7 +63,7 @@ def declared_delay(rate: float) -> Callable[[Any], tuple[Any, int]]:
 
 
 class _TickingClock(Clock):
-    """Station clock for its guard, which waits for control: waiting means ticking."""
+    """Clock of the station's guard: when the guard waits for control, this clock runs ticks until the time has come."""
 
     def __init__(self, clock: Clock, tick: Callable[[], None]) -> None:
         self._clock, self._tick = clock, tick
@@ -154,7 +154,10 @@ class ServedLockstep(Lockstep):
             self._figures.write()
 
     def _tick_ahead(self) -> None:
-        """Run a tick early because an e-stop press waits; later ticks are delayed as much, or time would run faster."""
+        """Run a tick early because an e-stop press waits.
+
+        Later ticks are delayed by one period, because otherwise time would run faster than real time.
+        """
         self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
         self.tick()
 
@@ -173,7 +176,10 @@ class ServedLockstep(Lockstep):
         )
 
     def _is_unpaced(self) -> bool:
-        """Return True if ticks need no pace, because no operator has to watch them in real time."""
+        """Return True if ticks may follow each other as fast as possible.
+
+        That is so if no operator watches them in real time.
+        """
         if self._paced:
             return False
         state, run = self.coordinator.session.state, self.coordinator.run

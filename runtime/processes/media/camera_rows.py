@@ -37,7 +37,7 @@ class _Camera:
     spoken: float = -math.inf  # time of the last report [s]
 
     def set_silent(self, silent: bool, row: int) -> None:
-        """Record that the camera stops at row `row`, or returns if not `silent`."""
+        """Record that the camera stops sending at row `row` (`silent`) or sends again."""
         self.silent, self.row = silent, row
         if silent:
             self.unsaid_from = self.unsaid_from if self.unsaid else row

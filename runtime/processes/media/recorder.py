@@ -208,7 +208,7 @@ class Recorder:
             self._chunks.add_merge(merged)
 
     def add_tick(self, tick: ExecutedTick) -> None:
-        """Record one control tick: the full-rate stream, and every grid row that is now known."""
+        """Record one control tick at the full control rate, and write every grid row that is complete with it."""
         if not self._uuid or self._complete or (self._run and tick.run != self._run):
             return
         if self._schema.reported:
@@ -241,7 +241,7 @@ class Recorder:
         return replace(tick, executed=self._applied, source="none" if reported is None else "teleop")
 
     def _target(self, row: int) -> int:
-        """Return the step of row `row`: the row is the last tick not later than it."""
+        """Return the control step at which row `row` is due; the last tick not later than this step becomes the row."""
         assert self._first_step is not None
         # The tolerance prevents that rounding moves a row which falls exactly on a tick to the previous tick.
         return self._first_step + math.floor(row * self._grid.control_rate / self._grid.fps + 1e-9)
@@ -253,9 +253,10 @@ class Recorder:
         return None
 
     def _write_row(self, tick: ExecutedTick, observation: Observation | None) -> None:
-        """Write one row; `observation` is the tick's observation, None if it is no longer available.
+        """Write one row of the dataset grid for a tick.
 
-        Joints come from the tick.
+        `observation` is the one that the tick used, None if it is no longer available. Joints are taken from the tick,
+        so that a row always has them.
         """
         action = tick.qpos if tick.executed is None else tick.executed
         measured = None if observation is None else observation.eef

@@ -83,7 +83,11 @@ class Reception:
         self._report_in_time()
 
     def leave_realtime(self) -> None:
-        """Leave the real-time class, because the incoming data would block guard and coordinator."""
+        """Leave the real-time class and emit an event.
+
+        Needed if the incoming data use so much processor time that reception in this class would block guard and
+        coordinator.
+        """
         realtime.leave_realtime_all()
         self._scheduling = "ordinary"
         text = _CLASS_GIVEN_UP(seconds=_SHARE_S)
@@ -146,8 +150,9 @@ def make_source(
 ) -> Source:
     """Create the source, not yet connected: the transport's, with the deployment's own cameras added.
 
-    The transport gets a robot without these cameras, because it must not wait for them. Cameras that the transport
-    leaves out anyway remain in that robot. `build` replaces the constructor of the transport's kind.
+    The transport gets a description of the robot without the cameras that the deployment opens itself, because it must
+    not wait for their pictures; cameras that it does not deliver anyway remain in the description. `build` replaces the
+    constructor of the transport's kind.
     """
     settings = spec.deployment
     own = settings.cameras.keys() & set(delivered_cameras(settings, spec.robot))

@@ -38,7 +38,7 @@ class BeltMotion:
         return tuple(self.knots[self.knots[:, 3] != 0.0, 0].tolist())
 
     def x(self, seconds: float) -> float:
-        """Return the position of a block on the belt [m], `seconds` after its start."""
+        """Return the position [m] of a block on the belt, `seconds` after the start of the motion."""
         seconds = min(max(seconds, 0.0), self.duration)
         start, x, speed, acceleration = self.knots[
             int(np.searchsorted(self.knots[:, 0], seconds, "right")) - 1

@@ -67,7 +67,7 @@ class TrackingErrors:
 
 
 class Conveyor(Tabletop):
-    """Tabletop with a belt, a block on it and a plate out of the way; fingers act on the block as on any tabletop.
+    """Tabletop with a belt, a block on the belt, and a plate out of the way; fingers move the block as on any tabletop.
 
     `escort` has the tracking errors since the last reset.
     """
@@ -95,8 +95,10 @@ class Conveyor(Tabletop):
         return self.over and self.escort.on_target_share >= REQUIRED
 
     def truth(self) -> dict[str, object]:
-        """Return the ground truth for the node's observation; its part `chase` is about the time since the reset, in mm
-        and s.
+        """Return the ground truth for the node's observation.
+
+        Its part `chase` has the time since the belt started, in seconds, and the fingertips' distances from their
+        place, in mm.
         """
         distance = self.distance()
         return super().truth() | {
@@ -155,7 +157,10 @@ class Conveyor(Tabletop):
         """Do nothing, because a conveyor has no milestones of lifting and carrying."""
 
     def _measure(self) -> None:
-        """Record the fingertips' distance if the belt runs; once they are beside the block, let the belt start."""
+        """Add the fingertips' distance to the tracking errors if the belt runs.
+
+        The belt is started as soon as the fingertips are within tolerance of their place beside the block.
+        """
         distance = self.distance()
         if self.running:
             self.escort.add(distance)

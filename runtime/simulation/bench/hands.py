@@ -71,9 +71,9 @@ class Jaws:
 
 
 class Opening:
-    """Conversion between a gripper's joint value and the proportional distance between its fingers [m].
+    """Linear conversion between a gripper's joint value and the distance between its fingers [m].
 
-    If the description does not declare the distance, it is 0 when closed and 0.1 m when open.
+    If the description does not declare the distances of the closed and the open gripper, they are taken as 0 and 0.1 m.
     """
 
     def __init__(self, gripper: Gripper) -> None:

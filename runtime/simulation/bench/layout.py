@@ -79,7 +79,10 @@ def _place(name: str, value: Any, count: int) -> list[float] | None:
 def _pair(
     chance: np.random.Generator, block: list[float] | None, plate: list[float] | None
 ) -> tuple[tuple[float, float, float], tuple[float, float]]:
-    """Return places of block and plate, drawn until they are far enough apart and reachable from one side."""
+    """Return places of block and plate, each drawn at random, or near its requested place if there is one.
+
+    Unless both are requested, they are drawn again until they are far enough apart and reachable from one side.
+    """
     for _ in range(_TRIES):
         block_x, block_y, yaw = _random_place(chance) if block is None else _random_near(chance, block)
         plate_x, plate_y, _ = _random_place(chance) if plate is None else _random_near(chance, [*plate, 0.0])

@@ -92,8 +92,9 @@ class Tabletop:
         return BenchState(tuple(block.state() for block in self._blocks), (float(x), float(y)))
 
     def truth(self) -> dict[str, object]:
-        """Return the ground truth for the node's observation; the milestones of its first block are since the last
-        reset.
+        """Return the ground truth for the node's observation.
+
+        Its milestones are those that the first block has reached since the last reset.
         """
         placed = self._on_plate(0.0)
         return {
@@ -176,7 +177,7 @@ class Tabletop:
         return max(heights)
 
     def _separate(self, block: Block, neighbour: Block, seconds: float) -> None:
-        """Slide a block away from another block that it overlaps, as far as it moves in `seconds`."""
+        """Slide a block away from another block that it overlaps, at a limited speed for `seconds`."""
         if block.held_by or abs(block.pose[2, 3] - neighbour.pose[2, 3]) > 0.9 * block.edge:
             return
         offset = block.pose[:2, 3] - neighbour.pose[:2, 3]
@@ -187,7 +188,10 @@ class Tabletop:
             block.shift(direction * min(depth, _APART_SPEED * seconds))
 
     def _clear_rim(self, block: Block, seconds: float) -> None:
-        """Slide a block that touches the plate from the side away from it, as far as it moves in `seconds`."""
+        """Slide a block that stands on the table and touches the plate's rim away from the plate.
+
+        It moves at a limited speed for `seconds`.
+        """
         if block.bottom > self.bench.plate_height - _RIM:
             return
         offset = block.pose[:2, 3] - self._plate

@@ -65,8 +65,9 @@ class Painter:
                 self._paint_solid(picture, corners, solid, facing)
 
     def _facing(self, eye: Float32, chosen: NDArray[np.intp]) -> dict[int, tuple[float, ...]]:
-        """Return by face the colour (blue, green, red) of those faces of the chosen solids that `eye` sees from
-        outside.
+        """Return the visible faces of the chosen solids with their colours (blue, green, red).
+
+        A face is visible if `eye` is on its outer side.
         """
         solids, normals = self._solids, self._placed.normals
         is_chosen = np.zeros(len(solids.solids), bool)

@@ -59,7 +59,7 @@ class RosRobot(ABC):
     """Simulated robot as a ROS node; call `open`, then `tick` at the rate, then `close`.
 
     Raises:
-        SetupError: If --silence names none of the topics, or the start pose does not exist.
+        SetupError: If --silence names a topic that the robot does not have, or the start pose does not exist.
     """
 
     VERSION: ClassVar[Literal[1, 2]]
@@ -121,7 +121,7 @@ class RosRobot(ABC):
         return self._surroundings.truth()
 
     def outlets(self) -> Iterator[JointTopic]:
-        """Yield the topics on which the robot receives commands."""
+        """Yield the topics on which the robot receives commands: those for simulation if the options select them."""
         for group in self._robot.groups:
             topic = self._groups[group.name]
             if self._options.as_simulation:

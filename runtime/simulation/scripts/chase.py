@@ -98,8 +98,9 @@ class ChaseEpisode:
             self._seen.append((now, block[0], block[1]))
 
     def _ahead(self, times: Float64) -> tuple[Float64, Float64]:
-        """Return extrapolated positions of the block along the belt at `times` [n], and its newest position across it
-        [n].
+        """Return the block's expected places at `times` [n]: positions along the belt [n] and across it [n].
+
+        Positions along the belt are extrapolated; the position across it is the newest one, repeated.
         """
         samples = np.array(self._seen)
         newest = samples[-1]

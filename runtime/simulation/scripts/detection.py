@@ -76,8 +76,10 @@ class OverheadDetector:
         return Detection(self._block(image, hsv), self._plate(hsv))
 
     def _block(self, image: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
-        """Return the block's pose from its silhouette: its middle is at half the block's height, its smallest box has
-        its yaw.
+        """Return the block's place and yaw from its silhouette, or None.
+
+        The place is computed from the middle of the smallest rectangle around the silhouette, at half the block's
+        height; the yaw from the direction of this rectangle.
         """
         colour = self._bench.block_colours[0]
         contour = _largest(_mask(hsv, colour))

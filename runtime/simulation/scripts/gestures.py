@@ -55,12 +55,16 @@ class Gesture:
         return np.asarray(np.clip(target, self._robot.lower, self._robot.upper))
 
     def phase_of(self, q: Float64) -> float:
-        """Return the phase of joints [D]; for joints off the path, that of the path's point in their direction."""
+        """Return the phase of joints [D].
+
+        It depends only on the direction of the first two joints from the centre of their circle, so that it is defined
+        for joints off the path, too.
+        """
         sine, minus_cosine = ((q - self._centre) / np.maximum(self._room, 1e-9))[self._clockwork]
         return float(np.arctan2(sine, -minus_cosine))
 
     def towards(self, phase: float, q: Float64, seconds: float) -> Float64:
-        """Return the joints [D] that are reached from `q` within `seconds`, on the way to the path's point at
+        """Return the joints [D] after moving from `q` at limited speed for `seconds` towards the path's point at
         `phase`.
         """
         reach = self._speed * seconds

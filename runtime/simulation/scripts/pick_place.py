@@ -58,10 +58,10 @@ class ScriptError(RuntimeFault):
 class Skill:
     """Deliberate imperfection of the policy.
 
-    `noise` [m] is the standard deviation of the error of the block's place in x and in y, drawn for each attempt; noise
-    of one block edge corresponds to one radian of noise on the block's yaw. `failure_rate` is the probability that in
-    an episode the policy drops the block on the way or always grasps short of it; `seed` decides both, episode by
-    episode.
+    `noise` [m] is the standard deviation of the error of the block's place in x and in y, drawn for each attempt. The
+    yaw has an error as well: with noise of one block edge its standard deviation is one radian. `failure_rate` is the
+    probability that in an episode the policy drops the block on the way or always grasps short of it; `seed` decides
+    both, episode by episode.
     """
 
     noise: float = 0.0
@@ -72,7 +72,8 @@ class Skill:
 class PickPlace(Script):
     """Pick-and-place policy for all connections; its episodes are numbered across them, so that each has its own noise.
 
-    `apart` measures how far joints are from rows; by default it compares joints.
+    `apart` is the function that computes the distances of the robot's joints from rows of a route; by default the
+    largest difference of a joint.
     """
 
     def __init__(
@@ -195,9 +196,9 @@ class PickPlaceEpisode:
         self._follow_route(None)
 
     def _is_over(self, pause: float) -> bool:
-        """Return True if a new episode begins after the pause [s].
+        """Return True if the episode ended before a pause in the requests of `pause` [s].
 
-        That is so if the pause is long, and the task was finished, or nearly so, before it.
+        That is so if the pause is long, and before it there was no route or the arm was already leaving the plate.
         """
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED
@@ -239,9 +240,10 @@ class PickPlaceEpisode:
             self._row = self._agreed(row, q)
 
     def _agreed(self, row: float, q: Float64) -> float:
-        """Return the row that follows from the time, unless the joints show that the robot was delayed or moved.
+        """Return the row at which to continue: `row`, which follows from the time, if the joints `q` agree with it.
 
-        Then return a row near the one that matches the joints.
+        If the joints show that the robot was delayed or moved, return a row slightly ahead of the one nearest to the
+        joints.
         """
         route, rate = self._on(), self._policy.rate
         leg, start = route.legs[self._leg], route.starts[self._leg]
@@ -283,7 +285,10 @@ class PickPlaceEpisode:
 
 
 def joints_apart(robot: Robot) -> Apart:
-    """Return a function that computes the largest distance [rad] to each row over the URDF's joints except grippers."""
+    """Return a function that computes for each row its largest joint difference from given joints [rad].
+
+    It compares the joints of the URDF except grippers.
+    """
     moving = np.concatenate([group.joint_dims[np.array(group.urdf_joints) != ""] for group in robot.groups])
 
     def apart(arm: Group, rows: Float64, q: Float64) -> Float64:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 class PoseScript(Script):
-    """Script that converts the joint rows of another script to poses; its requests are those of the other script.
+    """Script that answers the requests of another script, with the joint rows of its answers converted to poses.
 
-    Its metadata declares the format of its rows; `rate` [Hz] is their rate.
+    The metadata declare the format of the rows; `rate` [Hz] is the rate of the rows.
 
     Raises:
         SetupError: If the format does not fit the robot.

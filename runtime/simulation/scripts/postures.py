@@ -1,8 +1,9 @@
 """Joints of an arm for fingertips that point down above a block or a plate.
 
 Four points of every vertical path are solved by inverse kinematics. The solver starts from a nominal posture of the arm
-with its fingers down, which is searched once. The posture is rotated about the first joint if that is upright;
-otherwise it is moved from place to place.
+with its fingers down, which is searched once. If the first joint turns the arm about the vertical, the nominal posture
+is rotated about it towards the path. Otherwise, or if that fails, the solver follows a path from the nominal posture to
+the first point.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ Tilts = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nominal:
-    """Posture `joints` [n] of an arm with fingertips at `down`; the jaws open at the angle `across` to its bearing."""
+    """Joints `joints` [n] of an arm whose fingertips point down at the pose `down`.
+
+    `across` is the angle between the bearing of this pose and the direction in which the jaws open [rad].
+    """
 
     joints: Float64
     down: DownwardTip
@@ -159,10 +163,10 @@ class Postures:
     def _descent(
         self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[DownwardTip]
     ) -> Float64 | None:
-        """Return joints [stations, D] for the stations; None if one of them is not reached.
+        """Return joints [stations, D] for the poses `stations`; None if the arm does not reach one of them.
 
-        The search begins at the nominal posture, rotated about an upright shoulder. If this fails, or the shoulder is
-        not upright, it follows a path from the nominal posture to the first station.
+        If the first joint is upright, the search begins at the nominal posture, rotated about this joint. If this
+        fails, or the joint is not upright, the search follows a path from the nominal posture to the first pose.
         """
         start = opened(arm, q)
         start[arm.joint_dims] = nominal.joints

@@ -165,10 +165,9 @@ class RoutePlanner:
         )
 
     def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: PlannedFailure) -> list[Leg]:
-        """Return the legs of a route, given joints [stations, D] from the top down to the block (`down`) and plate
-        (`over`).
+        """Return the legs of a route from joints `q` [D].
 
-        Both have open jaws.
+        `down` and `over` are joints [stations, D] from the top down to the block and to the plate, both with open jaws.
         """
         gripped, lowered = (closed(arm, descent) for descent in (down, over))
         legs = []

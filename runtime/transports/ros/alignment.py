@@ -13,8 +13,9 @@ from runtime.core.clock import ClockMap, ClockStepDetector
 class RosClock:
     """Clock map shared by all streams of a robot, so that a stream's own delay remains part of its age.
 
-    Clock steps are detected per stream, because a camera may be later than joints by more than a step. After a step,
-    earlier stamps cannot be compared with later stamps, and the map starts anew.
+    Steps of the senders' clock are detected separately for each stream: with a common detector, a camera that is much
+    later than the joints would look like a step. After a step, earlier stamps cannot be compared with later stamps, and
+    the map starts anew.
     """
 
     def __init__(self) -> None:

@@ -163,10 +163,10 @@ class DdsMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Return by topic the number of connected peers, and why another was refused, from DDS's own status.
+        """Return for each topic the number of connected peers, and the reason if a further peer was refused.
 
-        If a topic has no peer, the discovery data are searched for peers with another message type. A refusal is
-        reported for the rest of the middleware's life, because DDS only counts refusals.
+        Both are from DDS's own status. If a topic has no peer, the discovery data are searched for peers with another
+        message type. A refusal is reported for the rest of the middleware's life, because DDS only counts refusals.
         """
         from cyclonedds.core import DDSException
 

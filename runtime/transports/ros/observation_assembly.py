@@ -111,7 +111,10 @@ class Assembly:
     def _captured(
         self, values: Mapping[str, StampedValue], pictures: Mapping[str, UInt8]
     ) -> dict[str, float]:
-        """Return the capture time by stream; that of "joints" and of "eef" is the one of their oldest message."""
+        """Return the capture time of each camera, of "joints", and of "eef" if there are poses.
+
+        The time of "joints" and that of "eef" are each the time of the oldest message that contributes.
+        """
         times = {
             "joints": min(values[p.name].captured for p in self._stream("joints") + self._stream("gripper"))
         }

@@ -91,7 +91,10 @@ class RclMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Return by topic the number of peers in the ROS graph, and why another was refused, e.g. its message type."""
+        """Return for each topic the number of peers in the ROS graph, and the reason if a peer was refused.
+
+        A reason is, for example, another message type.
+        """
         matches = {}
         for name, topic in self._subscribed.items():
             expected = f"{PACKAGES[topic.message]}/msg/{topic.message}"

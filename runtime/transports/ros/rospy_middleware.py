@@ -64,8 +64,9 @@ class TcpRosMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Return by topic the number of peers that the child last reported; without a peer, also the reason if it is
-        known.
+        """Return for each topic the number of peers that the child last reported.
+
+        If a topic has no peer, the reason is included as far as it is known.
         """
         with self._lock:
             matches = {}

@@ -78,7 +78,10 @@ class RosSink(Sink):
             publish(payload)
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Return the reason, "" if unknown, by command topic that has no subscriber or has refused one."""
+        """Return the command topics without a subscriber, or with one that was refused, and the reason.
+
+        The reason is "" if it is unknown.
+        """
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
 

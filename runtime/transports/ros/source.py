@@ -75,9 +75,9 @@ class AcceptanceLimits:
 class RosSource(Source):
     """Source of the newest frame of aligned messages; there is no frame while streams are too far apart.
 
-    Messages are checked on the middleware's thread when they arrive, and faults are counted by name. Reading removes
-    nothing from `alignment`; this source has a cursor of its own in it. Each reason why no frame arrives is reported
-    once as an event.
+    Messages are checked on the middleware's thread when they arrive, and faults are counted by name. Other readers may
+    use the same `alignment`: reading removes nothing from it, and this source remembers its own last frame. Each reason
+    why no frame arrives is reported once as an event.
     """
 
     _cursor: Aligned[StampedValue] | None  # last delivered frame
@@ -161,9 +161,10 @@ class RosSource(Source):
         return events
 
     def stalled(self) -> dict[str, float]:
-        """Return by stream without a usable message for too long the age of its newest message [s].
+        """Return for each stalled stream the age of its newest usable message [s].
 
-        Without any message, the age is the time since `connect`.
+        A stream stalls if it has had no usable message for too long. If it never had one, the age is the time since
+        `connect`.
         """
         now, began = self._clock.now(), self._began
         ages = {part.name: now - self._heard_at.get(part.name, began + _GRACE_S) for part in self._parts}

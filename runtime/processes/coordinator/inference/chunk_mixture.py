@@ -91,7 +91,8 @@ class Mixture:
     def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
         """Return True if the linear mixture `straight` equals `meant` within tolerance.
 
-        `meant` is the mixture as control makes it. The two differ if angles wrap.
+        `meant` is the mixture as control makes it. They differ, for example, if angles wrap. `like` is a chunk with the
+        same columns.
         """
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)

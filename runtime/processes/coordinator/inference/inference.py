@@ -45,7 +45,7 @@ class FaultTimeouts:
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """Query half of a strategy, with its parameters."""
+    """Part of a strategy that decides when to query the policy, with the strategy's parameters."""
 
     query: Query
     parameters: StrategyParameters
@@ -212,7 +212,7 @@ class Inference:
             self._post(proposal)
 
     def cancel(self) -> None:
-        """Discard the requested, shown or sent chunk, and clear failures."""
+        """Discard the newest chunk, whether it is requested, shown as a proposal or sent, and clear failures."""
         self._flight, self._stale_since = None, None
         self.retry.reset()
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
@@ -305,8 +305,9 @@ class Inference:
     def _try_request(self) -> bool:
         """Send a request; return True if its response is available at once.
 
-        Control judges gaps in the observations action by action. But while a strategy waits for this response there are
-        no actions, so a lasting gap is an error here too.
+        If the newest observation is too old, no request is sent and False is returned; an error is raised once this has
+        lasted longer than permitted. Control also checks the age of observations, but only when it executes an action,
+        and there are none while a strategy waits for this response.
         """
         now = self._clock.now()
         waited = self._mode in ON_DEMAND or self._strategy.query.requests_while_stopped

@@ -107,10 +107,11 @@ class PolicyObservation:
         return int(status["step"]), np.array(status["commanded"], np.float64)
 
     def _step_of(self, observation: Observation) -> int:
-        """Return the control step of an observation: that of the tick that used it, or of the next tick.
+        """Return the control step of an observation.
 
-        If control stalls, the step is more than one ahead of the newest tick: steps follow the clock, and missed ticks
-        are skipped.
+        That is the step of the tick that used it or, if no tick has used it yet, of the next tick. If control has
+        missed ticks, the next tick is more than one step ahead of the newest, because steps follow the clock and missed
+        ticks are skipped.
         """
         status = self._shared_state.control.read()
         step, planned = int(status["step"]), float(status["planned"])
@@ -120,9 +121,9 @@ class PolicyObservation:
         return step + max(1, math.ceil(periods - 1e-6))
 
     def _of_the_simulated_robot(self, observation: Observation) -> Observation:
-        """Return the observation with the simulated robot's joints, without other measurements of the real robot.
+        """Return the observation with the simulated robot's joints, and without velocities, efforts and poses.
 
-        Before its first tick the simulated robot is where the real one is.
+        Before the first tick of the simulated robot the observation is returned unchanged.
         """
         joints = np.array(self._shared_state.control.read()["simulated"], np.float32)
         if not np.isfinite(joints).all():

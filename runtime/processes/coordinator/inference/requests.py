@@ -50,10 +50,10 @@ Committed = Callable[[Observation], Conditioning | None]
 
 @dataclass(frozen=True, slots=True)
 class MissBound:
-    """Greatest permitted errors of solved poses.
+    """Greatest permitted errors of poses that inverse kinematics has solved.
 
-    These are the error of position [m] and of rotation [rad], and `jump`, the greatest lag of the joints behind a pose
-    [rad].
+    `position` [m] and `rotation` [rad] bound the errors of a pose; `jump` [rad] bounds how far the joints may lag
+    behind the pose.
     """
 
     position: float
@@ -238,9 +238,10 @@ class PolicyRequests:
     def _chunk_start(
         self, observation: Observation, waited: bool, rests: bool, k_max: int | None
     ) -> ChunkStart:
-        """Return where the chunk will take over: the commanded position, and the first row that can be executed.
+        """Return where the chunk will take over: the present command, and the first row that can be executed.
 
-        That row follows the newest control step. If the robot is at rest, the chunk starts from the measured joints.
+        This row is the one after the newest control step; with `waited` it is row 0. If the robot `rests`, the chunk
+        starts from the measured joints.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         newest = self.policy_observation.commanded()
@@ -286,7 +287,7 @@ class PolicyRequests:
         return cut, _ROWS_REFUSED(wrong=wrong, kept=usable - first)
 
     def _refused(self, commands: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
-        """Return the reason why row `row` is refused, "" if it is not, and whether its pose is within reach."""
+        """Return the reason why row `row` is refused, "" if it is not, and True if its pose is within reach."""
         free, distance = self._spaces.meet(commands, row)
         over = bound.misses(free)[0]
         if over.any():

@@ -16,7 +16,11 @@ _LONGEST_S = 0.5  # [s] between two attempts: finds a policy that returns just b
 
 
 class Retry:
-    """Consecutive failures of a policy; `say(kind, text)` reports the first failure and the recovery."""
+    """Consecutive failures of a policy, with growing delays between retries.
+
+    `patience` [s] is the time without a response after which the policy is given up. `say` is called with the kind and
+    text of an event at the first failure and at the recovery.
+    """
 
     def __init__(self, clock: Clock, patience: float, say: Callable[[str, str], None]) -> None:
         self._clock = clock

@@ -54,7 +54,7 @@ class Runner(ABC):
 def as_policy_errors(what: str) -> Iterator[None]:
     """Convert exceptions within the context to a PolicyError that begins with `what`, and log the traceback.
 
-    So no response of a policy may end the coordinator. A RuntimeFault is passed on.
+    A RuntimeFault is not converted. The coordinator handles both kinds, so that no response of a policy can end it.
     """
     try:
         yield
@@ -110,11 +110,11 @@ class ThreadRunner(Runner):
 
 
 class DeclaredRunner(Runner):
-    """Runner that executes calls between two ticks; a result is ready after the number of ticks `declared` for it.
+    """Runner that executes calls between two ticks; a call's result is ready after a declared number of ticks.
 
-    Calls start at `start_waiting`. They run on a thread, so that the ticking thread can answer commands meanwhile; no
-    tick may pass while a call is running. Therefore the step at which a result is ready does not depend on the call's
-    real duration.
+    The function `declared` converts what a call returned to its result and this number. Calls start at `start_waiting`.
+    They run on a thread, so that the ticking thread can answer commands meanwhile; no tick may pass while a call is
+    running. Therefore the step at which a result is ready does not depend on the call's real duration.
     """
 
     def __init__(self, declared: Callable[[Any], tuple[Any, int]]) -> None:
@@ -137,7 +137,7 @@ class DeclaredRunner(Runner):
         return future
 
     def start_waiting(self) -> bool:
-        """Start all waiting calls; return whether a call is running."""
+        """Start all calls that were submitted and not started yet; return True while a call is running."""
         while self._waiting:
             self._thread.submit(partial(self._make, *self._waiting.popleft()))
         return self._thread.busy

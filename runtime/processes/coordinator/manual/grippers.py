@@ -73,7 +73,10 @@ class Grippers:
         self.locks = locks
 
     def settled_locks(self, commanded: Float64) -> Float64:
-        """Return the locks float64 [D]; a lock that its gripper has not reached is set to the commanded position."""
+        """Return the locks float64 [D] with which all grippers stay where they are.
+
+        A lock that its gripper has not reached is replaced by the commanded position.
+        """
         commanded = snap_grippers(self._switches, commanded, commanded)
         travel = self._limits.upper - self._limits.lower
         away = np.abs(self.locks - commanded) > _REACHED * travel  # NaN (unlocked) compares as False

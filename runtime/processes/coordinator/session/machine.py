@@ -116,9 +116,10 @@ class SessionMachine:
         return {kind: reason for kind, reason in reasons.items() if reason}
 
     def handle(self, command: Command) -> Ack:
-        """Execute `command` and return the answer; a repeated uuid gets the first answer again.
+        """Execute `command` and return the answer; if its uuid was answered before, return that answer again.
 
-        A uuid of another command is no repetition: a stop is executed all the same, other commands are refused.
+        If the earlier command with this uuid was of another kind, the new command is no repetition: a stop is executed
+        all the same, any other command is refused.
         """
         if not command.uuid:  # all such commands would be repetitions of each other
             return self._ack(command, "refused", _NO_UUID)
@@ -206,7 +207,7 @@ class SessionMachine:
     def _stops_without(self, command: Command) -> bool:
         """Return True if the command is a stop that needs no lease.
 
-        Such a stop comes from the station's panel, or the run is unattended.
+        That is so if it comes from the station's panel, or the run is unattended.
         """
         if command.kind not in STOPPING:
             return False

@@ -21,7 +21,7 @@ _POLICY_WITHOUT_RTC = Pattern(
 
 
 def strategy_of(spec: StationSpec) -> Strategy:
-    """Return the query half of the specification's strategy."""
+    """Return the part of the specification's strategy that decides when to query the policy."""
     settings = spec.deployment.strategy
     return Strategy(variants("runtime.strategies")[settings.kind].query(settings), settings)
 

@@ -300,7 +300,8 @@ class SetUp:
     def _report_zero_joints(self) -> None:
         """Emit an event about joints that read exactly 0.
 
-        A dead encoder reads 0 from the first sample on, so that only the operator can distinguish the two cases.
+        A dead encoder reads 0 from the first sample on, so that only the operator can tell it from a joint that is at
+        0.
         """
         limits = self._plan.limits
         joints = self._shared_state.observation.read()["qpos"]
@@ -345,7 +346,7 @@ class SetUp:
     def _require_family(self) -> None:
         """Raise SetupError if a process has an expired heartbeat.
 
-        Orders to a silent control would be lost, and control holds without the guard.
+        Orders to a silent control would be lost, and without the guard's heartbeat control only holds.
         """
         within = self._plan.deployment.heartbeat_timeout_s
         for process in SIBLING_PROCESSES:
@@ -366,9 +367,9 @@ class SetUp:
         return self._start_reset()
 
     def _start_reset(self) -> bool:
-        """Start the reset of the bench, now that the arms are out of the way; without one, start the warm-up.
+        """Start the reset of the bench, now that the arms are out of the way.
 
-        Return True if nothing is left to do.
+        If no reset was requested, start the warm-up. Return True if the set-up is then complete.
         """
         if self._reset is None:
             return self._start_warm_up()
@@ -409,7 +410,10 @@ class SetUp:
         return True
 
     def _stage_lasted(self, name: str, least: float) -> bool:
-        """Return True if the stage has lasted long enough, so that its duration does not identify the policy."""
+        """Return True if the stage has lasted at least `least` [s].
+
+        Least durations keep people from recognising a policy in a blind comparison by the duration of a stage.
+        """
         waited = self._waited()
         self.took.setdefault(name, waited)
         return waited >= least

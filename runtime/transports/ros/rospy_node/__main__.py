@@ -239,8 +239,9 @@ class PeerMonitor:
                     self._refused[index] = self._absence(index, peers[0], spoken)
 
     def _absence(self, index: int, node: str, spoken: bool) -> str:
-        """Return why `node`, which the master lists for the topic, is not connected; `spoken`: this process publishes
-        it.
+        """Return why `node`, which the master lists for the topic, is not connected to this process.
+
+        `spoken`: this process publishes the topic, so that the node is a subscriber; otherwise the node is a publisher.
         """
         name, message_class, _ = self._topics.open[index]
         verb = "subscribes to" if spoken else "publishes"
