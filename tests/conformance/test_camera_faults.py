@@ -60,7 +60,8 @@ def test_every_fault_that_a_stand_in_can_play_is_played() -> None:
 
 @pytest.mark.parametrize(("kind", "fault"), [(kind, fault) for kind in KINDS for fault in ON_OPENING[kind]])
 def test_what_was_found_in_its_place_is_said(kind: str, fault: str) -> None:
-    with watched(kind, fault, open_s=_looked_for(fault)) as (_, camera):
+    seconds = _looked_for(fault)
+    with watched(kind, fault, open_s=seconds, read_s=seconds) as (_, camera):
         until(lambda: camera.health().failed)
         health = camera.health()
         assert (health.condition, health.why) == (CameraCondition.OPENING, ON_OPENING[kind][fault])
