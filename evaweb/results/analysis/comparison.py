@@ -197,7 +197,9 @@ def _test_times(t: ComparedTrials) -> SignFlipTest | None:
 def _answer_chance(c: Comparison, test: ExactTest, context: AnswerContext) -> list[Answer]:
     fixed = "n as planned" if context.fixed else "as if n had been fixed"
     corrected = f", Holm {probability(c.corrected)}" if context.several and c.corrected is not None else ""
-    return [("Is the difference significant?", f"Barnard, two-sided, {fixed}", f"{p_words(test.p)}{corrected}")]
+    return [
+        ("Is the difference significant?", f"Barnard, two-sided, {fixed}", f"{p_words(test.p)}{corrected}")
+    ]
 
 
 def _answer_scenes(_: Comparison, effect: Stratified, __: AnswerContext) -> list[Answer]:
