@@ -87,11 +87,12 @@ class RatingOut(Schema):
 class JudgementOut(Schema):
     """Verdict of an automatic judge on a trial.
 
-    `milestones` is JSON: [[text, reached, probability of having been reached], ...], with two nulls if the judge gave
-    no
-    verdict on it; `reason` tells why there is none at all. `pictures` is JSON: [[camera, time in s, SHA-256], ...] of
-    the
-    pictures that the judge was shown; `prompt` is the SHA-256 of the prompt.
+    `milestones` is JSON: one entry [text, reached, probability of having been reached] per milestone; the last two are
+    null
+    if the judge gave no verdict on that milestone. `reason` tells why the judge gave no verdict on the trial.
+    `pictures` is
+    JSON: [[camera, time in s, SHA-256], ...] of the pictures that the judge was shown; `prompt` is the SHA-256 of the
+    prompt.
     """
 
     uuid: UUID

@@ -37,9 +37,10 @@ class _PendingRequest(Generic[T]):
 
 
 class RequestCoalescer(Generic[T]):
-    """Pending requests to stations; thread-safe, and callers do not block.
+    """Pending requests to stations, in which requests with equal station and key share an answer.
 
-    `most` limits the concurrent keys per station, None for no limit.
+    It is thread-safe, and callers do not block. At most `most` different keys may be pending per station; None for no
+    limit.
     """
 
     def __init__(self, name: str, most: int | None = None) -> None:

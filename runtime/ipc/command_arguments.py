@@ -65,12 +65,14 @@ class LeastTimes(Settings):
 
 
 class SetUpRequest(Settings):
-    """`setup`: differences from the deployment for this set-up; absent keys use the deployment's.
+    """Arguments of `setup`: changes of the deployment for this set-up; absent keys keep the deployment's values.
 
-    `policy` is merged into the deployment's [policy] as a file is into the file that it extends: a table of another
-    `kind` replaces it completely. `checkpoint` is only recorded. `collect`: a person drives the robot, according to the
-    deployment's [collection]; absent: only if the deployment has no policy. `least` prevents that two policies can be
-    told apart by their durations.
+    `policy` is merged over the deployment's [policy], or replaces it completely if its `kind` is another. `checkpoint`
+    is
+    only recorded. With `collect` a person drives the robot, according to the deployment's [collection]; if it is
+    absent,
+    a person drives only if the deployment has no policy. `least` are minimum durations of the set-up's stages, so that
+    two policies cannot be told apart by them.
     """
 
     policy: Map | None = None

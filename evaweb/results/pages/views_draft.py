@@ -209,7 +209,7 @@ def _spread(query: QueryDict) -> float:
 
 @require_GET
 def power(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render the power of the saved draft at the rates of the address, as far as computed."""
+    """Render the statistical power of the saved draft at the success rates in the URL, as far as it is computed."""
     plan = plan_get(name=name, version=version, user=request.user)
     if plan.state != PlanState.DRAFT:  # frozen while its page was still polling: 204 ends the polling
         return HttpResponse(status=204)

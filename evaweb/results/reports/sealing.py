@@ -42,10 +42,10 @@ def record_to_seal(plan: Plan) -> dict[str, Any]:
 
 
 def _measured(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return one digest of the measurements of all runs.
+    """Return a digest of the measurements of all runs (`digest`), and their `names`.
 
-    `later` lists the trials whose recording has not been analysed yet: measurements from recordings are left out for
-    them.
+    `later` in the result lists the trials whose recording has not been analysed yet: the digest covers only those of
+    their measurements that need no recording.
     """
     later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
     values = [

@@ -95,10 +95,11 @@ class Conveyor(Tabletop):
         return self.over and self.escort.on_target_share >= REQUIRED
 
     def truth(self) -> dict[str, object]:
-        """Return the ground truth for the node's observation.
+        """Return the ground truth that is published with an observation.
 
-        Its part `chase` has the time since the belt started, in seconds, and the fingertips' distances from their
-        place, in mm.
+        Its entry `chase` has the time since the belt started [s], and the distances of the fingertips from the moving
+        target
+        position beside the block [mm].
         """
         distance = self.distance()
         return super().truth() | {

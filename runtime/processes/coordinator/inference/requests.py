@@ -254,11 +254,13 @@ class PolicyRequests:
         return ChunkStart(commanded, qpos if rests else commanded, row)
 
     def _within(self, commands: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
-        """Return the rows before the first refused pose from row `first` on, and the reason, "" if none is refused.
+        """Return the rows up to the first refused pose, and the reason; all rows and "" if no pose is refused.
 
-        A pose is refused if it is out of reach, or if the joints would lag behind it by more than a jump. A smaller lag
-        is permitted, as for joint rows that the safety filter limits. If a run `begins` with such a distant pose, that
-        row is kept, so that control reports the distance.
+        Poses before row `first` are not checked, because they will not be executed. A pose is refused if it is out of
+        reach, or if the joints would lag behind it by more than a jump. A smaller lag is permitted, because the safety
+        filter also limits joint rows. If `begins` and row `first` itself is refused for its lag, that row is kept, so
+        that
+        control reports the distance.
 
         Raises:
             PolicyError: no row remains.
