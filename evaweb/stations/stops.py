@@ -89,8 +89,8 @@ def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> F
 def request_stop(command: messages.Command, station: str) -> Future[Answer]:
     """Send a stop or halt and return the future of the answer.
 
-    While an equal request of the same lease is pending, calls with another uuid do not share its answer: they are combined into
-    one more request, which is sent afterwards.
+    While an equal request of the same lease is pending, calls with another uuid do not share its answer: they are
+    combined into one more request, which is sent afterwards.
     """
     key = (command.kind, command.holder, command.epoch)
     try:
