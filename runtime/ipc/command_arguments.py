@@ -68,11 +68,9 @@ class SetUpRequest(Settings):
     """Arguments of `setup`: changes of the deployment for this set-up; absent keys keep the deployment's values.
 
     `policy` is merged over the deployment's [policy], or replaces it completely if its `kind` is another. `checkpoint`
-    is
-    only recorded. With `collect` a person drives the robot, according to the deployment's [collection]; if it is
-    absent,
-    a person drives only if the deployment has no policy. `least` are minimum durations of the set-up's stages, so that
-    two policies cannot be told apart by them.
+    is only recorded. With `collect` a person drives the robot, according to the deployment's [collection]; if it is
+    absent, a person drives only if the deployment has no policy. `least` are minimum durations of the set-up's stages,
+    so that two policies cannot be told apart by them.
     """
 
     policy: Map | None = None
@@ -91,10 +89,10 @@ class SetUpRequest(Settings):
 
 
 class PreflightRequest(Settings):
-    """`preflight`: policy to query without the robot; absent keys use the deployment's.
+    """Arguments of `preflight`: policy to query without the robot; absent keys keep the deployment's values.
 
     `policy` and `strategy` are as in a set-up; `id` names the report. The preflight ends after `deadline_s` [s] at the
-    latest; absent: after the time that the policy's own deadlines amount to.
+    latest; if it is absent, after the sum of the policy's own deadlines.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
@@ -137,10 +135,10 @@ class CollectSession(Settings):
 
 
 class RunRequest(Settings):
-    """`run`: `trial` is the requester's and is copied to the manifest unchanged; `duration_s` ends this run [s].
+    """Arguments of `run`; absent keys keep the deployment's values.
 
-    If operator, duration_s, mode or sim_state are absent, the deployment's apply. `task` and `session` are for the mode
-    "collect", which is that of a station set up to collect.
+    `trial` is copied to the manifest unchanged. The run ends after `duration_s` [s] at the latest. `task` and `session`
+    are for the mode "collect" of a station that was set up to collect.
     """
 
     trial: Map | None = None
@@ -167,9 +165,9 @@ class LabelRequest(Settings):
 
 
 class TuneRequest(Settings):
-    """`tune`: another strategy, other parameters, or another instruction; absent keys do not change.
+    """Arguments of `tune`: another strategy, other parameters, or another instruction; absent keys stay unchanged.
 
-    `strategy` is merged into the one in force; its parameters are kept if the `kind` changes.
+    `strategy` is merged over the present one; its parameters are kept even if the `kind` changes.
     """
 
     strategy: Map | None = None
@@ -192,10 +190,10 @@ class Jog(Settings):
 
 
 class AimRequest(Settings):
-    """`aim`: preview of a motion; nothing moves.
+    """Arguments of `aim`: preview of a motion; nothing moves.
 
-    `joints` [D] are the target, or the start of a jog (the commanded joints if absent, or for null values); `pose` is a
-    named pose.
+    `joints` [D] are the target, or the start of a jog; joints that are absent or null are at their commanded positions.
+    `pose` is a named pose.
     """
 
     joints: list[float | None] | None = None
@@ -204,9 +202,9 @@ class AimRequest(Settings):
 
 
 class MoveRequest(Settings):
-    """`move`: move to `joints` [D] or to a named `pose` on a limited path; null joints do not move.
+    """Arguments of `move`: target `joints` [D] or a named `pose`; joints that are null do not move.
 
-    `speed` is the share of the speed of the station's own motions that may be used.
+    `speed` is a share of the speed of the station's own motions.
     """
 
     joints: list[float | None] | None = None

@@ -61,8 +61,8 @@ class PostedChunk:
     """Chunk in command space at control rate, not yet merged: float64 [H, D].
 
     Row 0 is for `observation_step`. If `requested_while_stopped`, the robot was at rest during the request (or while a
-    person reviewed the chunk), and row 0 is for the first free tick. `intended_start` [D] is where the policy intends
-    to begin, at any distance; None: row 0.
+    person reviewed the chunk), and row 0 is for the first free tick. `intended_start` [D] is the position at which the
+    policy intends to begin, at any distance from the robot; None if that is row 0.
     """
 
     chunk_id: int
