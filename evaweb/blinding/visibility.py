@@ -56,10 +56,10 @@ class Visibility:
 
     Attributes:
         checkpoints: Ids of the hidden checkpoints.
-        names: Their names.
-        stations: Names of stations at which a trial of a plan that is blind for the user was handed out.
+        names: Names of the hidden checkpoints.
+        stations: Names of stations that have been handed a trial of a plan that is blind for the user.
         busy_stations: Names of stations with an unfinished trial of such a plan.
-        keys: Ids of these plans.
+        keys: Ids of the plans that are blind for the user.
         plans: Titles of these plans as text.
         user: Id of the account, None without an account.
     """

@@ -85,10 +85,14 @@ _ROLLOUTS = "rollouts"  # reserved prefix of datasets with policies' runs
 def open_session(
     *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
 ) -> CollectSession:
-    """Open a session with the station's present set-up; for operators, while no other user commands the station.
+    """Open a session with the station's present set-up.
 
-    `dataset` "" selects the deployment's own. Raises: Conflict if a session is open at the station, or the dataset was
-    collected with another set-up; SetupChanged lists every difference.
+    The user must be an operator, and no other user may command the station. If `dataset` is "", the session uses the
+    deployment's dataset.
+
+    Raises:
+        Conflict: A session is open at the station.
+        SetupChanged: The dataset was collected with another set-up; the message lists every difference.
     """
     require_role(user, Role.OPERATOR)
     task = clean_text("task", task, LONGEST_TASK)

@@ -196,9 +196,10 @@ def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:
 
 
 def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Position | None:
-    """Return the position after the last trial's; the same position again if that trial has no score.
+    """Return the position that follows that of the trial `last`; after the last position, the first.
 
-    The first position without a last trial, None if the scene has no positions.
+    If `last` has no score, its own position is returned. If `last` is None, or its position is not among `positions`,
+    the first position is returned. The result is None if there are no positions.
     """
     if not positions:
         return None

@@ -271,7 +271,8 @@ def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> CameraMatch:
 def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     """Store the current images before the run, with their match to the position's references.
 
-    Raises: Conflict if a match is below the plan's least one and `override` has no reason.
+    `override` is the reason for which a low match is accepted. Raises: Conflict if a match is below the least match
+    that the plan requires, and `override` is empty.
     """
     require_role(user, Role.OPERATOR)
     reason = clean_text("override", override, LONGEST_NOTE)

@@ -291,7 +291,7 @@ def blocks_that_count(plan: Plan) -> list[Block]:
 def findings_of(plan: Plan) -> Findings | None:
     """Return the findings of the frozen design from the blocks that count; None without a comparison.
 
-    Those are the blocks of the reveal if there was one, else the current ones.
+    For a revealed plan, the blocks that count are those of the reveal, else the current ones.
     """
     frozen = frozen_design(plan.document) if plan.document else None
     if frozen is None:
@@ -302,8 +302,9 @@ def findings_of(plan: Plan) -> Findings | None:
 def dropped_of(plan: Plan) -> dict[str, int]:
     """Return the checkpoints that a running plan's rule has dropped, and after how many blocks.
 
-    A trial that is being repeated counts with its score until its repetition is scored. If it counted as missing, a
-    drop could be undone, the omitted trials would come next, and the operator would recognise their checkpoint.
+    A trial that is being repeated counts with its score until its repetition is scored. If such a trial counted as
+    missing, a drop could be undone; the omitted trials would then come next, and the operator would recognise their
+    checkpoint.
     """
     frozen = frozen_design(plan.document) if plan.document else None
     if frozen is None or not frozen.drops:

@@ -52,7 +52,7 @@ _DRAWN_BY_ITSELF = 6  # format from which the order within each block is drawn i
 
 
 def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
-    """Return the frozen form of a draft as plain JSON; `key` draws the schedule.
+    """Return the frozen form of a draft as plain JSON; the schedule is drawn from the secret `key`.
 
     Raises: UnevenError if the drawn random order does not fit the design; EvaError if the design is invalid.
     """

@@ -94,10 +94,12 @@ def pairs_needed(
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Comparison of all designs; each tuple is in the order of RULES.
+    """Comparison of all designs.
 
-    `needs`: design that reaches the wanted power; `chances`: power and number of pairs with the given pairs; `powers`:
-    one tuple of powers per gain.
+    Attributes:
+        needs: For each rule in RULES, the design that reaches the wanted power; None if there is no such design.
+        chances: For each rule in RULES, the power and number of pairs of the design with the given number of pairs.
+        powers: For each gain in the success rate, the powers of the designs in the order of RULES.
     """
 
     needs: tuple[DesignPower | None, ...]

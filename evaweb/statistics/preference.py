@@ -64,11 +64,16 @@ class Contrast:
 
 @dataclass(frozen=True, slots=True)
 class Preferences:
-    """Fitted preferences.
+    """Preferences as fitted by the model.
 
-    `worth` and `error` are centred log-worths and their standard errors by policy; `contrasts` are by pair
-    (alphabetical). `tie` is nu (None without ties): equal policies tie with probability nu / (1 + nu). `order` is the
-    log odds that being first adds, `order_z` its z; both None if not fitted.
+    Attributes:
+        worth: Centred log-worth of each policy.
+        error: Standard error of each log-worth.
+        contrasts: Contrast of each pair of policies, whose names are in alphabetical order.
+        tie: Parameter nu: equal policies tie with probability nu / (1 + nu). None without ties.
+        order: Log odds that being shown first adds; None if not fitted.
+        order_z: z value of `order`; None if not fitted.
+        log_likelihood: Log likelihood of the fit.
     """
 
     worth: Mapping[str, float]

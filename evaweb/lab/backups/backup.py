@@ -86,7 +86,7 @@ def make(folder: Path, *, keep: int | None, tell: Tell) -> Backup:
         tell: Called with a text for each part.
 
     Raises:
-        BackupError: If it fails; nothing of it is left.
+        BackupError: If the backup fails; then none of its files are left.
     """
     folder = folder.expanduser().absolute()
     data = Path(settings.DATA_DIR).absolute()

@@ -86,10 +86,11 @@ class AttemptRecord:
 
 
 def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[BenchImage]) -> dict[str, Any]:
-    """Return the conduct of a plan as a dict, with one entry for each subject of this module.
+    """Return the conduct of a plan as a dict.
 
-    `runs` are all attempts, `looks` all camera checks of the bench before them. One more query is made for each earlier
-    version of the plan.
+    Its keys are the subjects of this module, such as `looks`, `corrections` and `deviations`; its values are the
+    results of the functions below. `runs` are all attempts, `looks` all camera checks of the bench before them. One
+    more query is made for each earlier version of the plan.
     """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {

@@ -117,9 +117,11 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
 
 
 def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, Any]:
-    """Return what each design needs for the input, what the available time can detect, and power by gain.
+    """Return the answers of the calculator to the input `q`.
 
-    It is computed on behalf of `person`: nobody may use more than a share of the computing time.
+    They are the trials that each design needs, the difference that can be detected in the available time, and the power
+    of each design by gain in the success rate. The computation uses the share of computing time of `person`, which is
+    limited.
 
     Raises:
         Busy: If the share of `person` is used up.

@@ -314,7 +314,7 @@ def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
 
 
 def score_bets(differences: Sequence[float]) -> list[float]:
-    """Return log e after each difference of scores, of a bet that their mean is above 0.
+    """Return the log wealth after each difference of scores, of a bet that the mean difference is above 0.
 
     Five gamblers with equal money and one stake each act as one gambler with the wealth-weighted mean of their stakes.
     """
