@@ -80,7 +80,7 @@ class Visibility:
     def hides_plan(self, plan: Any) -> bool:
         """Return True if the plan's checkpoints are hidden, and with them its question, digest and amendments.
 
-        The draft of an amendment reveals the same as the plan that it amends.
+        The draft of an amendment is hidden like the plan that it amends, because it reveals the same.
         """
         return plan.pk in self.keys or (plan.state == "draft" and plan.amends_id in self.keys)
 

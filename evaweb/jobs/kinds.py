@@ -25,7 +25,8 @@ class Queue(StrEnum):
 class JobContext:
     """Context of one job for the function of its kind: arguments and progress reports.
 
-    `hold` waits until no other job holds any of the given names, and then holds them instead of its earlier ones.
+    `hold` waits until no other job holds any of the given names; from then on this job holds them, and releases the
+    names that it held before.
     """
 
     args: Args

@@ -104,10 +104,11 @@ def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
 
 @transaction.atomic
 def confirm_cameras(*, user: User, station: Station, first: bool = False) -> CameraCheck:
-    """Record that each camera shows the same as its reference, with its current image and match.
+    """Record that the user has confirmed each camera to show the same as its reference picture.
 
-    With `first`, missing references are created from the current images. Raises: Conflict, which names cameras without
-    reference.
+    The record has each camera's current image and its match to the reference. With `first`, missing references are
+    created from the current images.
+    Raises: Conflict, which names the cameras without reference.
     """
     require_role(user, Role.OPERATOR)
     cameras = cameras_of(station)

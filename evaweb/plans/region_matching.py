@@ -1,9 +1,9 @@
 """Regions of a reference picture around objects, and the match of a live picture in each.
 
-A region's match is a normalised cross-correlation of the three colours at the camera's own resolution, but at most 640
-pixels wide: the best within TOLERANCE of the drawn place. Both pictures are band-passed first to details of 5 to 33
-pixels, which removes sensor noise and slowly varying light. Brightness has no influence, nor has contrast between half
-and double; beyond that the match decreases, so that a faint trace of an object does not match.
+A region's match is the largest normalised cross-correlation of the three colours within TOLERANCE of the drawn place.
+It is computed at the camera's own resolution, but at most 640 pixels wide. Both pictures are band-passed first to
+details of 5 to 33 pixels, which removes sensor noise and slowly varying light. Brightness has no influence, nor has
+contrast between half and double; beyond that the match decreases, so that a faint trace of an object does not match.
 """
 
 from __future__ import annotations

@@ -221,10 +221,11 @@ def _accepted(images: Iterable[BenchImage]) -> dict[int, tuple[float | None, str
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Return how many trials that count each operator, or each station, made of each checkpoint.
+    """Return the number of trials that count, by operator or station and by checkpoint.
 
-    `name` is "operator" or "station". `uneven` is the largest number of trials by which one of them differs from a
-    proportional share of a checkpoint's trials. Dropped checkpoints and random order alone do not increase it.
+    `name` is "operator" or "station". Key `uneven` of the result is the largest number of trials by which an operator
+    or station differs from a proportional share of a checkpoint's trials. Dropped checkpoints and random order alone do
+    not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -308,9 +309,10 @@ def _broken_off(runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
 
 
 def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    """Return every correction of a score, and first scores given after the reveal (`late`).
+    """Return every correction of a score, and every first score given after the reveal.
 
-    `changed` is "verdict", or "category" (of a failure) or "note" if the verdict is unchanged.
+    In each dict, key `late` is True for scores after the reveal. Key `changed` is "verdict" or, if the verdict is
+    unchanged, "category" (of a failure) or "note".
     """
     by_trial, corrections = {run.trial: run for run in runs}, []
     scores = Score.objects.filter(trial__handout__plan=plan)
@@ -441,7 +443,8 @@ def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
 def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     """Return the camera checks made at the plan's stations during its trials.
 
-    `unchecked` has the codes of the trials that no sufficiently recent check by the same operator preceded.
+    Key `unchecked` of the result has the codes of the trials before which the same operator made no sufficiently recent
+    check.
     """
     handed = [run.handed_at for run in runs]
     if not handed:
@@ -473,8 +476,8 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
 def _bench(plan: Plan, runs: Iterable[AttemptRecord], images: Iterable[BenchImage]) -> dict[str, Any]:
     """Return the plan's match gate, and the runs that did not demonstrably pass it.
 
-    `low` are runs with a match below the gate, `unmatched` runs without a known match, and `references` the cameras
-    whose reference image was replaced during the plan.
+    Of the result's keys, `low` has the runs with a match below the gate, `unmatched` the codes of runs without a known
+    match, and `references` the cameras whose reference image was replaced during the plan.
     """
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []

@@ -123,8 +123,8 @@ def next_to_rate(user: User) -> NextItem[Handout]:
 def _rated_first(change: str, trial: Trial, user: User) -> None:
     """Refuse to let a potential second rater of the trial correct the wording of its score.
 
-    Correcting first would disqualify them as a rater, and mostly for failures; and a rater must not know the score's
-    wording.
+    The correction would disqualify the user as a second rater, mostly of failures, and a second rater must not know the
+    score's wording.
 
     Raises:
         NotAllowed: If `change` is "reworded" and the user may still be asked to rate the trial.
