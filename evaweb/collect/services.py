@@ -177,10 +177,12 @@ def publish_session(
     results: Sequence[str] = selectors.PUBLISHED_RESULTS,
     version: str = "",
 ) -> list[Job]:
-    """Queue the publication of the accepted episodes with these results that are in no dataset yet.
+    """Queue the publication of the session's accepted episodes that are in no dataset yet, and return the jobs.
 
-    `version` is the version of a new dataset. "" selects the version of the existing dataset or, for a new one, the
-    default. Raises: Conflict if there is nothing to publish, or the dataset has another version.
+    Only episodes with one of the `results` are published. `version` is the version of a new dataset; "" selects the
+    version of the existing dataset or, for a new one, the default.
+
+    Raises: Conflict if there is nothing to publish, or the dataset has another version.
     """
     require_role(user, Role.OPERATOR)
     allowed = [result.value for result in Result if result.value]

@@ -274,7 +274,7 @@ def remove(*, name: str) -> None:
     A station without any history or plan is deleted too; any other is deactivated.
 
     Raises:
-        NotFound: If there is none.
+        NotFound: If there is no deployment of that name.
         Conflict: If the station is in use.
     """
     stored = stored_deployment(name)

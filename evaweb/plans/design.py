@@ -349,10 +349,11 @@ def crossed_while_waiting(plan: Plan, since: datetime) -> str:
 
 
 def visible_close_reason(plan: Plan, sealed: bool) -> str:
-    """Return why the plan was closed; if it is `sealed` for the reader, only a reason that the server gave.
+    """Return why the plan was closed.
 
-    Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not confused
-    with them.
+    If the plan is `sealed` for the reader, only a reason that the server gave is returned, and "" in place of an
+    owner's. Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not
+    taken for one of them.
     """
     if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
         own = any(plan.closed_because.startswith(f"{text}, after ") for text in ENDED.values())
@@ -370,9 +371,10 @@ def register_reveal_data(told: Callable[[Plan], dict[str, Any]]) -> None:
 
 
 def reveal_record(plan: Plan) -> dict[str, Any] | None:
-    """Return the data stored at a reveal with its digest: counting blocks, sums per checkpoint, registered data.
+    """Return the data stored at a reveal, with their digest: blocks that count, sums per checkpoint, registered data.
 
-    Later corrections do not change the plan's headline. None for a plan without a comparison before format 7.
+    Because the data are stored, later corrections do not change the plan's headline. None for a plan without a
+    comparison before format 7.
     """
     document = plan.document or {}
     if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:

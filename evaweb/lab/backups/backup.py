@@ -207,8 +207,8 @@ def restore(path: Path, tell: Tell) -> Backup:
     into the data folder when all are complete.
 
     Raises:
-        BackupError: If it fails. After a failure that comes later than the start of the database's restore, the folder
-            RESTORING remains, and no lab starts while it exists.
+        BackupError: If it fails. If the restore of the database has begun by then, the folder RESTORING remains, and no
+            lab starts while that folder exists.
     """
     backup, backend = Backup.at(path.expanduser().absolute()), databases.database()
     about = backup.about["database"]

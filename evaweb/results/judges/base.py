@@ -52,7 +52,8 @@ class StillImage:
 class TrialCase:
     """Trial as shown to a judge, without code, checkpoint, score, plan, operator or file names.
 
-    `truth` has for each step whether the bench reports it as reached, None if it reports nothing.
+    `truth` has one entry for each of `steps`: whether the bench reports the step as reached, None if it reports
+    nothing.
     """
 
     instruction: str
