@@ -44,10 +44,10 @@ print(json.dumps(found))
 
 
 def measure(seconds: float) -> Report:
-    """Measure `found.WHO.P0.P1` and `pairs.WHO.P0.P1`, in which WHO is ours or nscore.
+    """Measure the figures `found.WHO.P0.P1` and `pairs.WHO.P0.P1`, in which WHO is ours or nscore.
 
-    `found` is the share of runs that separate the policies (wrongly, if they are equal). `pairs` is the median number
-    of pairs until they are separated; a run that never separates them counts with all its pairs.
+    The figure `found` is the share of runs that separate the policies (wrongly, if they are equal). The figure `pairs`
+    is the median number of pairs until they are separated; a run that never separates them counts with all its pairs.
     """
     scores = [step / STEPS for step in range(STEPS + 1)]
     figures: list[Figure] = []

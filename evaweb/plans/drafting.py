@@ -36,10 +36,11 @@ class Changed:
 
 
 def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
-    """Return the values of the draft that its pages edit, without hidden checkpoints.
+    """Return the values of the draft that its pages edit, by field, without hidden checkpoints.
 
-    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint that is compared with it.
-    If the plan has only these two checkpoints, `challenger` is None, because it follows from `control`.
+    Checkpoints are given by their ids. The value `control` is the checkpoint with which others are compared, the value
+    `challenger` the checkpoint that is compared with the control. If the plan has only these two checkpoints, the value
+    `challenger` is None, because it follows from the control.
     """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     control, challenger = _roles(plan)

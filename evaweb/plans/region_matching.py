@@ -103,11 +103,12 @@ def check_sizes(found: list[Region], jpeg: bytes) -> None:
 
 
 def match_regions(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
-    """Return for each region {"name", "at", "match", "dx", "dy", "words"}.
+    """Return for each region a dict with the keys "name", "at", "match", "dx", "dy" and "words".
 
-    `at` is the region, [x, y, width, height] as fractions; `match` ranges from 1 (identical) to 0; `dx` (to the right)
-    and `dy` (down) are the displacement of the object in pixels of the live picture, None if it is not recognised;
-    `words` is the same as text. Raises: EvaError if the live picture is so small that a region has no pixel.
+    "at" is the region, [x, y, width, height] as fractions of the picture. "match" ranges from 1 (identical) to 0. "dx"
+    (to the right) and "dy" (down) are the displacement of the object in pixels of the live picture `now`, None if the
+    object is not recognised. "words" is the same as text. Raises: EvaError if the live picture is so small that a
+    region has no pixel.
     """
     live = decoded(now, "RGB")
     before, after = _to_common_size([decoded(reference, "RGB"), live])

@@ -79,9 +79,11 @@ def trial_command(
     uuid: UUID | str | None = None,
     args: Mapping[str, Any] | None = None,
 ) -> Command:
-    """Send a command for a trial; `setup` and `run` get their arguments from the trial, other commands from `args`.
+    """Send a command for a trial.
 
-    Never call it within a transaction. After an accepted run the trial is running and its episode has a row.
+    The commands "setup" and "run" get their arguments from the trial, other commands from `args`. After an accepted run
+    the trial is running, and the database has a row for its episode. Never call this within a transaction.
+
     Raises: Conflict if the trial is not prepared, or the station was last set up for something else.
     """
     require_role(user, Role.OPERATOR)

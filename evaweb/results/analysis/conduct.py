@@ -118,8 +118,8 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Benc
 def looked_behind(plan: Plan) -> list[dict[str, Any]]:
     """Return the recorded unblindings of the plan, its earlier versions and related plans, in order of time.
 
-    Unblindings after the end of the plan are left out. In each row `own` is True if exactly this version was unblinded,
-    and `before` if the unblinding preceded the freeze of this plan.
+    Unblindings after the end of the plan are left out. In each row, key `own` is True if exactly this version was
+    unblinded, and key `before` is True if the unblinding preceded the freeze of this plan.
     """
     of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(
         plan__in=overlapping_plans(plan)

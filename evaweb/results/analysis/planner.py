@@ -156,8 +156,8 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
 def design_for_power(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
     """Return a design by `rule` that reaches the power, with its maximum and average trials and robot hours.
 
-    `found` is its power and number of pairs; if None, no such design exists and `pairs` is None. The averages are None
-    unless a single pair of checkpoints is compared (`alone`).
+    `found` is the power and number of pairs of that design. It is None if no such design exists; then the result has
+    None as "pairs". The averages are None unless a single pair of checkpoints is compared (`alone`).
     """
     if found is None:
         return {"rule": rule, "pairs": None}
