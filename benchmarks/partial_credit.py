@@ -1,7 +1,7 @@
 """Pairs until partial credit separates two policies: our e-process and NSCORE's supermartingale, on the same pairs.
 
 NSCORE (Snyder et al.) is not part of the product, and requires cvxpy and matplotlib: it runs in a separate environment,
-which is created by hand, and is omitted if that does not exist.
+which is created by hand. Without that environment NSCORE is not measured.
 
   python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
 """

@@ -114,7 +114,8 @@ class _Samples:
 class _TipTrack:
     """Positions of all end effectors [steps, arms, 3] at the control rate, one span per uninterrupted motion.
 
-    They are linearly interpolated between samples. `seen` is the number of samples per second, None without samples.
+    The positions are linearly interpolated between samples. `seen` is the number of samples per second, None without
+    samples.
     """
 
     spans: tuple[Array, ...]

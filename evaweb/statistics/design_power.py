@@ -45,7 +45,7 @@ def design_power(
 ) -> DesignPower:
     """Return power and number of pairs of a design of at most `pairs` pairs.
 
-    They are exact, except for "evidence" (4,000 simulations). With a `margin` the power is that of a non-inferiority
+    Both are exact, except for "evidence" (4,000 simulations). With a `margin` the power is that of a non-inferiority
     test: the probability of finding that the first arm's rate is above the second's minus the margin. `looks` are the
     numbers of pairs after which there is a look; if empty, there is one after every pair.
     """

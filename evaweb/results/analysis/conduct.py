@@ -339,7 +339,8 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 def _amendments(plan: Plan) -> list[dict[str, Any]]:
     """Return the amendments of the plan with their reasons, newest first.
 
-    They are those that led from the first version to this one, and the one that made the next version, if there is one.
+    Included are the amendments that led from the plan's first version to this one, and the one that made the next
+    version, if there is one.
     """
     amendments, version = [], plan
     while version.amends is not None:
@@ -390,8 +391,8 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
 def _deviations(runs: Sequence[AttemptRecord], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return deviations from the schedule.
 
-    They are blocks split between stations or operators, trials out of order, time spans of blocks, and the slots that
-    stations gave back (`given_back`).
+    Included are blocks split between stations or operators, trials out of order, time spans of blocks, and the slots
+    that stations gave back (`given_back`).
     """
     blocks: dict[int, list[AttemptRecord]] = defaultdict(list)
     for run in runs:

@@ -1,6 +1,8 @@
-"""Declarations of statistics: each says how it is computed, written as JSON, and shown on pages and in reports.
+"""Declarations of statistics: each says how a statistic is computed, written as JSON, and shown on pages and in
+reports.
 
-They are the fields of `Arm` and `Comparison`; output is in the order of these fields (docs/contributing.md).
+The declarations are the fields of `Arm` and `Comparison`; output is in the order of these fields
+(docs/contributing.md).
 """
 
 from __future__ import annotations
