@@ -194,7 +194,7 @@ def _parquet_rows(content: bytes) -> int:
 
 
 def measure_allocation(seeded: Seeded) -> dict[str, float]:
-    """Let all operators request trials of one plan at all stations simultaneously, until none is left.
+    """Let all operators request trials of one plan at all stations simultaneously, until no trial is left.
 
     Return the numbers of trials allocated, left over or allocated wrongly, and the duration of requests.
     """

@@ -96,8 +96,8 @@ def query_aim(
 ) -> dict[str, Any]:
     """Return the station's answer about a target, as JSON.
 
-    The answer also has a key `links` [P * 16]: the poses that the parts of `looks`, the robot as drawn, have at the
-    target. It is [] if there are no such poses.
+    The answer also has a key "links" [P * 16]: the poses that the parts of `looks`, the robot as drawn, have at the
+    target. The list is empty if the robot is not drawn or the station gave no joints.
     """
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:

@@ -53,7 +53,7 @@ class BodyBound:
             the sessions in `keys` are looked up to find the user, who is that of the first session that has one.
         keys: Keys of the sessions that the request names.
         may_press: Whether the request may be an e-stop press. If the first `largest` bytes of a longer body are indeed
-            a press, the rest of the body is dropped instead of being refused.
+            a press, the rest of the body is dropped, and the body is not refused.
     """
 
     largest: int

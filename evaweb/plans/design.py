@@ -172,11 +172,15 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """Scored or interrupted attempt of a compared checkpoint, of slot `slot` in block `block`.
+    """Scored or interrupted attempt at a trial of a compared checkpoint.
 
-    `counts`: whether its score counts. `outcome` is the outcome by its newest score, `first` that by its first score;
-    both ignore scores after the result was stored, and are None without a score. `attempt` is above 1 if an earlier
-    attempt did not count.
+    Attributes:
+        slot: Index of the scheduled trial.
+        block: Block of that trial.
+        counts: Whether the attempt's score counts.
+        outcome: Outcome by the attempt's newest score, None without a score.
+        first: Outcome by its first score, None without a score. Both ignore scores after the result was stored.
+        attempt: Number of the attempt; above 1 if an earlier attempt did not count.
     """
 
     block: int

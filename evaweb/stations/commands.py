@@ -173,9 +173,9 @@ def record_estop(
     at: datetime,
     unverified: str = "",
 ) -> Command:
-    """Queue the row of an e-stop that was pressed at `at`; it is written when the database accepts it.
+    """Queue the row of an e-stop that was pressed at `at`; the row is written when the database accepts it.
 
-    `station` and `user` need only their names. `unverified`: why the user is unknown.
+    `station` and `user` need only their names. `unverified` is the reason why the user is unknown.
     """
     args = {"why": clean_reason(why)} | ({"unverified": unverified} if unverified else {})
     row = Command(

@@ -21,7 +21,7 @@ _ROW = "statistic"
 class Column:
     """Column of the table of checkpoints, on the page and in the report.
 
-    The report's program checks its cells.
+    The cells of the column are checked by the program that is part of the report.
 
     Attributes:
         head: Heading.

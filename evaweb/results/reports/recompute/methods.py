@@ -347,9 +347,11 @@ def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
 
 
 def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
-    """Return the two-sided probability of a sum of differences as large as this if each sign is equally likely.
+    """Return the two-sided probability of a sum of differences as large as the observed one if each sign is equally
+    likely.
 
-    Computed in integers: the coefficients of the product of all (1 + x^d), packed into one long number.
+    The probability is computed in integers: the coefficients of the product of all (1 + x^d), packed into one long
+    number.
     """
     units: list[int] = []
     for parts in (25_200, 2_520, 420, 60, 12):
