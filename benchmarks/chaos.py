@@ -1,9 +1,10 @@
 """Lab whose processes are killed while trials are run and scored; at the end, everything it acknowledged is counted.
 
-Lab and one station with a simulated robot are connected over loopback, each with its own data folder. Depending on the
-seed, processes of either are killed (SIGKILL), or the link is paused for seconds (SIGSTOP), as if it were cut. Never
-killed are the supervisors of lab and station, which restart the others, and the simulated robot and policy. A station
-whose processes end six times within a minute ends for good, so at most four are killed per minute.
+Lab and one station with a simulated robot are connected over loopback, each with its own data folder. At random times,
+drawn from the seed, a process of the lab or the station is killed (SIGKILL), or the link is paused for seconds
+(SIGSTOP), as if it were cut. The supervisors of lab and station, which restart the other processes, are never killed,
+nor are the simulated robot and the policy. A station whose processes end six times within a minute ends for good, so at
+most four are killed per minute.
 """
 
 from __future__ import annotations

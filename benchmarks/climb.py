@@ -1,6 +1,6 @@
-"""Number of stations, and of pages on one station, that a lab supports: doubled until an answer is too late.
+"""Number of stations that a lab supports, and of pages on one station: doubled until an answer is too late.
 
-Everything is on this machine: the lab, stations with simulated robots, pages. The bottleneck at the failing step need
+Lab, stations with simulated robots, and pages are all on this machine, so that the bottleneck at the failing step need
 not be the lab.
 """
 
@@ -69,8 +69,8 @@ def stations(
 ) -> tuple[list[Figure], list[Mapping[str, Any]]]:
     """Measure `stations_max`: the largest number of stations at which answers are in time.
 
-    Presses alternate between the stations, each of which has one open page. The first of `names` is running already;
-    `add` starts one more.
+    E-stop presses alternate between the stations, each of which has one open page. The station named first in `names`
+    is running already; `add` starts a further one by its name.
     """
     rungs: list[Any] = []
     up = 1

@@ -41,9 +41,9 @@ class Case(NamedTuple):
 
 
 def measure(seconds: float) -> Report:
-    """Measure `coverage.NAME.N`: the share of runs whose interval contains the truth.
+    """Measure `coverage.NAME.N`: the share of runs whose interval contains the true value.
 
-    N is the number of trials (per scene), conditions or pairs; for rates per hour the expected number of events.
+    N is the number of trials (per scene), conditions or pairs; for rates per hour it is the expected number of events.
     """
     figures, rows, runs = [], [], max(1, round(_RUNS_PER_SECOND * seconds))
     for name, case in CASES.items():

@@ -110,8 +110,9 @@ STEP = {((0.5, 0.7), 50): (0.464, 50), ((0.5, 0.8), 50): (0.838, 29), ((0.5, 0.7
 def measure(seconds: float, long: bool = False) -> Report:
     """Measure error and power of the designs, and the coverage of their intervals.
 
-    The figures are `type1.DESIGN.N`, `power.` and `median_pairs.` of DESIGN.P0.P1.N, `bias.WHAT.DESIGN.P0.P1.N` and
-    `drift.DESIGN.N`. With `long` designs of 250 pairs are measured, too; an interrupted measurement is continued.
+    The names of the figures are `type1.DESIGN.N`, `power.DESIGN.P0.P1.N`, `median_pairs.DESIGN.P0.P1.N`,
+    `bias.WHAT.DESIGN.P0.P1.N` and `drift.DESIGN.N`. With `long`, designs of 250 pairs are measured too, and an
+    interrupted measurement is continued.
     """
     rows: Courses = []
     store = PartStore() if long else None
@@ -182,8 +183,8 @@ def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
 def powers(rows: Courses) -> Iterator[Figure]:
     """Yield the power of each design, and of scipy's Barnard test for comparison.
 
-    The power of *late* has to be at least that of a fixed number of pairs minus 0.05. The power of *early* has to be at
-    least that of STEP minus 0.02, with at most a tenth more pairs.
+    The power of the design "late" has to be at least that of a fixed number of pairs minus 0.05. The power of "early"
+    has to be at least that of STEP minus 0.02, with at most a tenth more pairs.
     """
     for name, case in DESIGNS.items():
         for rates, n in SAME if case.margin else DIFFERENT:
@@ -205,7 +206,7 @@ def estimates(rows: Courses) -> Iterator[Figure]:
     """Yield the bias of the difference, raw and corrected for early stopping, and the coverage of the corrected
     interval.
 
-    Both are computed exactly, over every table at which the design ends.
+    Bias and coverage are computed exactly, over every table at which the design ends.
     """
     for name in ("late", "early"):
         exact = boundary_of(DESIGNS[name], SIZES[0])
@@ -363,8 +364,9 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
 def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
     """Return the largest error found, and the common rates at start, middle and end with which it occurs.
 
-    The rate is piecewise linear in time. The search begins with straight lines from a grid, then varies all three rates
-    around the best in ever finer steps, each as the angle whose squared sine is the rate.
+    The rate of both checkpoints changes piecewise linearly in time. Each rate is represented by the angle whose squared
+    sine is the rate. The search begins with straight lines from a grid of angles, then varies the three angles of the
+    best course so far, in ever finer steps.
     """
     angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
     lines = [(start, (start + end) / 2, end) for start, end in product(angles, repeat=2)]
@@ -388,9 +390,10 @@ def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, 
 
 
 def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the errors float64 [courses] for common rates before each pair, `rates` [courses, pairs].
+    """Return the probability of stopping for each course of rates: float64 [courses].
 
-    With a margin, the second rate is (1 - margin) times the given one, and the first is larger by the margin.
+    `rates` [courses, pairs] are the common success rates at each pair. With a margin, the second checkpoint's rate is
+    (1 - margin) times the given one, and the first checkpoint's rate is larger than that by the margin.
     """
     margin = exact.margin or 0.0
     pairs = exact.looks[-1].first

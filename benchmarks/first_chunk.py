@@ -1,6 +1,7 @@
 """Process that imports everything, builds one robot's kinematics, solves one chunk, and reports the cost.
 
-`python -m benchmarks.first_chunk KIND ROBOT` prints JSON: `rss_mb` after solving a chunk of the home pose.
+`python -m benchmarks.first_chunk KIND ROBOT` prints JSON with `rss_mb`, the memory [MB] after solving a chunk of the
+home pose.
 """
 
 from __future__ import annotations

@@ -143,8 +143,8 @@ def _timed(calls: Sequence[_Call], arms: int) -> dict[str, float]:
 def _judged(robot: Robot, chunks: Sequence[Chunk], solved: Sequence[IkResult]) -> dict[str, float]:
     """Return the quality of the solutions over all chunks; the speed of the first row is relative to the seed.
 
-    Errors of reachable targets count only frames that neither a joint limit nor a velocity limits; the share of limited
-    frames and their errors are reported separately.
+    For reachable targets, errors are taken only from frames that are at neither a joint limit nor a velocity limit; the
+    share of the other frames and their errors are reported separately.
     """
     dims = arm_dims(robot)
     q = np.stack([result.q for result in solved])[..., dims]
@@ -204,8 +204,8 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 def _postures(name: str) -> list[Figure]:
     """Return figures of the default backend on loops and long paths.
 
-    A `far` path has only one leg, to a posture anywhere within the limits. For figures ending with `chunks`, a path is
-    solved chunk by chunk, so that only the current chunk is known.
+    Figures with `far` are of paths with one leg only, to a posture anywhere within the limits. For figures with
+    `chunks`, a path is solved chunk by chunk, so that only the current chunk is known.
     """
     robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[_DEFAULT]

@@ -39,9 +39,10 @@ class Chunk:
 
 
 def invented(robot: Robot) -> dict[str, list[Chunk]]:
-    """Return chunks of every kind for a robot; except those out of reach, they are poses along a slow joint path.
+    """Return chunks of every kind for a robot, by the name of the kind.
 
-    `singular` chunks approach a singularity in the middle, `through` chunks pass through it.
+    Except for those out of reach, the chunks are poses along a slow joint path. Chunks of kind `singular` approach a
+    singularity in the middle, those of kind `through` pass through it.
     """
     chance = np.random.default_rng(5)
     kinds = ("smooth", "singular", "through", OUT_OF_REACH)

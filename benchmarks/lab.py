@@ -59,10 +59,12 @@ class _Page(LivePage):
 def measure(seconds: float) -> Report:
     """Measure a lab with a linked station; presses and idling last `seconds` each.
 
-    The figures are `estop_p99_ms` from a page through the link, `estop_here_p99_ms` at the station, and `lost_shown_s`;
-    `cpu_percent` and `memory_mb` of an idle station with its link, and of the lab's gate. For a transfer at full speed
-    they are `upload_mb_s`, the processor time of both ends, and the delay of presses meanwhile. `stations_max` and
-    `viewers_max` are measured by `benchmarks.climb`, with half of `seconds` per step.
+    The names of the figures:
+    * `estop_p99_ms`: delay of a press from a page through the link; `estop_here_p99_ms`: the same at the station.
+    * `lost_shown_s`: time until a lost link is shown.
+    * `cpu_percent` and `memory_mb`: of an idle station with its link, and of the lab's gate.
+    * `upload_mb_s`: speed of a transfer; processor time of both ends and delay of presses are measured meanwhile.
+    * `stations_max` and `viewers_max`: measured by `benchmarks.climb`, with half of `seconds` per step.
     """
     os.environ["EVA_UPLOAD_MB_S"] = "50"
     with tempfile.TemporaryDirectory() as name:

@@ -96,8 +96,8 @@ class ProcessorUsage:
     def percent(self) -> dict[str, float]:
         """Return the usage by process [% of one processor].
 
-        `lab` is the sum of its processes, `measuring` the benchmark's own (pages and comparison loops), `others`
-        everything else.
+        Key `lab` is the sum of the lab's processes, `measuring` the benchmark's own (pages and comparison loops),
+        `others` everything else on the machine.
         """
         seconds = time.monotonic() - self._begun
         now, before = self._times(), self._before

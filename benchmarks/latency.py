@@ -4,7 +4,7 @@
   is on its way to control and the answer is in its journal.
 * `node_ms`: from the same press until control passes the first changed command to the socket towards the node; at 30
   Hz a tick lasts 33 ms, so about half of that is waiting for the next tick.
-* `renew_ms`: the same round trip 20 times per second, without a change of state.
+* `renew_ms`: round trip of a renewal of the lease over the page's websocket, 20 times per second; no state changes.
 * `rest_ms`: Resume over REST, with its database row.
 * `observation_ms`: from the node's stamp to the policy request with this observation.
 * `muxed_ms`: from the node's stamp until the frame's packet is passed to the muxer.
@@ -84,9 +84,7 @@ class PressingPage(LivePage):
         super()._on_message(message)
 
     def _renew(self) -> None:
-        """Renew the lease, each time as soon as the previous answer has arrived, which is more often than a
-        page does.
-        """
+        """Renew the lease `_RENEWALS_HZ` times per second, which is more often than a page does."""
         while not self._failure:
             time.sleep(1.0 / _RENEWALS_HZ)
             if not self.epoch:

@@ -56,9 +56,10 @@ _ARRIVING_S = 10.0  # until fingertips must be next to the standing block
 
 @dataclass(frozen=True, slots=True)
 class ChaseResult:
-    """Result of an episode: lengths in mm, `share` of time on target, final `state` of the station.
+    """Result of an episode.
 
-    `acceleration` [rad/s2] is that of the joint whose commands change most, exceeded in 5 % of the ticks.
+    `share` is the share of time on target, `state` the final state of the station, `mean` and `p95` are distances [mm].
+    `acceleration` [rad/s2] is exceeded in 5 % of the ticks, by the joint whose commands change most.
     """
 
     strategy: str
@@ -89,8 +90,8 @@ def measure(seconds: float) -> Report:
 def table(seconds_budget: float) -> list[dict[str, Any]]:
     """Return a row for each strategy and delay [ticks]; distances in mm, means over the episodes.
 
-    Each is measured with at least three motions of the belt; a larger budget allows more. Their number depends on the
-    budget alone, not on the speed of the machine.
+    Each strategy and delay is measured with at least three motions of the belt, and more if `seconds_budget` is larger.
+    The number of motions depends on the budget alone, not on the speed of the machine.
     """
     seeds = range(max(SEEDS, int(seconds_budget / _PER_SEED_S)))
     cases = list(product(STRATEGIES, DELAYS, seeds))

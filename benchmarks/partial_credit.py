@@ -1,7 +1,7 @@
 """Pairs until partial credit separates two policies: our e-process and NSCORE's supermartingale, on the same pairs.
 
 NSCORE (Snyder et al.) is not part of the product, and requires cvxpy and matplotlib: it runs in a separate environment,
-which is created by hand, and is omitted if that does not exist.
+which is created by hand. Without that environment NSCORE is not measured.
 
   python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
 """
@@ -44,10 +44,10 @@ print(json.dumps(found))
 
 
 def measure(seconds: float) -> Report:
-    """Measure `found.WHO.P0.P1` and `pairs.WHO.P0.P1` for WHO = ours, nscore.
+    """Measure the figures `found.WHO.P0.P1` and `pairs.WHO.P0.P1`, in which WHO is ours or nscore.
 
-    `found` is the share of runs that separate the policies (wrongly, if they are equal). `pairs` is the median number
-    of pairs until then; a run that never does counts with all its pairs.
+    The figure `found` is the share of runs that separate the policies (wrongly, if they are equal). The figure `pairs`
+    is the median number of pairs until they are separated; a run that never separates them counts with all its pairs.
     """
     scores = [step / STEPS for step in range(STEPS + 1)]
     figures: list[Figure] = []

@@ -43,7 +43,8 @@ def measure(seconds: float, long: bool = False) -> Report:
     """Measure `frames_lost`, `intake_age_p99_ms`, `memory_growth_mb`, `cpu_core_percent`, `kill9_worst_loss_s` and
     others.
 
-    `load_1min` is the machine's load at the end; the load during each part is in the part's row.
+    The figure `load_1min` is the machine's load at the end of the benchmark; the load during each part is in the part's
+    row.
     """
     seed = random.SystemRandom().randrange(1 << 32)
     with tempfile.TemporaryDirectory() as name:

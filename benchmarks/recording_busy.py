@@ -92,9 +92,10 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
 
 
 def pictures(episode: Episode) -> dict[str, int]:
-    """Return the number of rows, and of images given to the recorder that are not in the videos.
+    """Return the number of rows, and of images that were given to the recorder but are not in the videos.
 
-    The latter are separated into images that the recording flags as `lost`, and `silent` losses.
+    The keys are `rows`, `lost` (missing images that the recording flags as lost) and `silent` (missing images that it
+    does not flag).
     """
     flagged = silent = 0
     rows = episode.rows

@@ -130,10 +130,10 @@ def make_episodes(data: Path, frames: Path, episodes: int = EPISODES) -> None:
 
 
 def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
-    """Kill the worker during its jobs, then let one worker finish; return a row per kill, and a last row with the
+    """Kill the worker during its jobs, then let one worker finish; return a row per kill and a last row with the
     result.
 
-    `problems` are sentences about files that cannot be opened.
+    Key `problems` of each row has sentences about files that cannot be opened.
     """
     environment = os.environ | {
         "EVA_DATA_DIR": str(data),

@@ -52,7 +52,7 @@ def main(path: str, count: str, folder: str, mode: str) -> None:
 def _operators() -> Any:
     """Declare operators that torchvision requires and that a torch without GPU support lacks.
 
-    The caller must keep the returned library alive; None if they are declared already.
+    Returns the library of the declarations, which the caller must keep alive; None if they are declared already.
     """
     import torch
 

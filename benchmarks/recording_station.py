@@ -160,10 +160,10 @@ def _missed(lab: Lab) -> int:
 
 
 def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
-    """Return the number of missing rows of the grid, and of images that were given but are not in the video.
+    """Return counts of missing rows of the grid, and of images that were given but are not in the video.
 
-    Images of `missed` observations are included. `grid_repeats` and `grid_skips` are not losses: source and grid have
-    independent clocks of 30 Hz.
+    `missed` is the number of observations that were not received; their images are included. The keys `grid_repeats`
+    and `grid_skips` count no losses: they exist because source and grid have independent clocks of 30 Hz.
     """
     rows, outcome = episode.rows, episode.outcome or {}
     times = rows.column("tick_time").to_numpy()

@@ -64,8 +64,9 @@ def with_disagreement(meant: IntendedRows) -> IntendedRows:
 def make_policy(meant: IntendedRows) -> Callable[[int, Conditioning | None], Float64]:
     """Return a policy with the rows of `meant` that continues its last chunk if the request is conditioned.
 
-    It replaces a model with real-time chunking: rows that will have been executed before the answer arrives are
-    repeated, then it changes to its current intention within 8 rows. It shows nothing about real models.
+    The policy stands in for a model with real-time chunking: it repeats the rows that will have been executed before
+    its answer arrives, then changes to its current intention within 8 rows. Results with it show nothing about real
+    models.
     """
 
     def policy(step: int, conditioning: Conditioning | None) -> Float64:

@@ -1,6 +1,6 @@
 """Result pages with 100,000 trials of 200 evaluations, exports, concurrent allocation, and the stopping rule.
 
-They are measured on SQLite, and on PostgreSQL if its programs and a driver are installed, with a server in a temporary
+All are measured on SQLite, and on PostgreSQL if its programs and a driver are installed, with a server in a temporary
 folder.
 """
 

@@ -63,10 +63,11 @@ def main() -> None:
 
 
 def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
-    """Return the durations of many requests by page [ms] and the largest number of queries of a request.
+    """Return by page the durations of many requests [ms], and the largest number of queries of a request.
 
-    The durations are p50 and p95 of the first request per evaluation, after the caches were cleared (cold), and of a
-    second one.
+    Each evaluation is requested twice. Keys that begin with `cold` are of the first requests, after the caches were
+    cleared; the other keys are of the second ones. `p50` and `p95` are percentiles; those with `cpu` are of processor
+    time.
     """
     from django.db import connection
     from django.test import Client
@@ -132,7 +133,8 @@ def _addresses(seeded: Seeded) -> dict[str, Callable[[Any], str]]:
 def planner(seeded: Seeded) -> dict[str, float]:
     """Return the delay of other pages while one viewer sends many different requests to the calculator.
 
-    The result has p95 of a page [ms], and the numbers of requests that were answered, and refused with a retry time.
+    Key `page_p95_ms` is the 95th percentile of the duration of a page. The keys `answered` and `refused` are numbers of
+    requests to the calculator; refused ones are given a time to retry.
     """
     from django.test import Client
 
@@ -192,7 +194,7 @@ def _parquet_rows(content: bytes) -> int:
 
 
 def measure_allocation(seeded: Seeded) -> dict[str, float]:
-    """Let all operators request trials of one plan at all stations simultaneously, until none is left.
+    """Let all operators request trials of one plan at all stations simultaneously, until no trial is left.
 
     Return the numbers of trials allocated, left over or allocated wrongly, and the duration of requests.
     """
@@ -249,9 +251,10 @@ def measure_allocation(seeded: Seeded) -> dict[str, float]:
 def _operator(
     plan: Any, operator: Any, station: Any, times: list[float], locked: list[str], faults: list[str]
 ) -> None:
-    """Request, run and score trials in a loop; if another operator's trial is on the station, wait for it.
+    """Request, run and score trials in a loop; if another operator's trial is on the station, wait until it ends.
 
-    If the database is locked for too long, the web refuses, the operator retries, and the refusal is added to `locked`.
+    If the database is locked for too long, the web refuses a request. The refusal is then added to `locked`, and the
+    operator retries.
     """
     from django.db import OperationalError, connection
 

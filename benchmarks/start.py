@@ -1,7 +1,7 @@
 """Time from `python -m runtime` of the tabletop deployment to its first idle snapshot, and the cost until then.
 
-The bench is running, and every file has been read before. Processor time and memory are those of each process at the
-snapshot; modules are those loaded at its end.
+The bench is running already, and every file has been read before. Processor time and memory of each process are
+measured at the snapshot; the loaded modules are listed at the end of the process.
 """
 
 from __future__ import annotations

@@ -86,8 +86,8 @@ class CaseEndpoints:
 class Case:
     """Transport to measure; its name is used in the figures.
 
-    `needs` is the kind of transport that must be available. `program` must be installed, unless it is "". `idle` is
-    False if memory growth is not measured, because another case covers it.
+    `needs` is the kind of transport that must be available. `program` is a program that must be installed, "" for none.
+    `idle` is False if memory growth is not measured, because another case covers it.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """Round trip of each policy protocol with its stand-in server, which is a separate process.
 
 Every request is a complete `infer`: three 224x224 images and 14 joints are sent, 50 rows of 14 numbers are received and
-checked. The published `openpi-client` sends the same observation to the same server, alternating with our client; it
-receives views of the same images, as in its own examples.
+checked. The published `openpi-client` sends the same observation to the same server, alternating with our client. It is
+given views of the same images, as in its own examples.
 """
 
 from __future__ import annotations

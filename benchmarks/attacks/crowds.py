@@ -67,7 +67,7 @@ def _head(target: Target, lines: str) -> bytes:
 async def _crowd(target: Target, size: int, head: bytes, then: _Then) -> Counter[str]:
     """Keep `size` connections open, and replace each that ends; return the number of answers by kind.
 
-    On each connection `head` is sent; after the answer, `then` is called with the connection.
+    On each connection `head` is sent; after the answer to it, `then` is called with the connection.
     """
     counts: Counter[str] = Counter()
     first_answers = [asyncio.Event() for _ in range(target.part(size))]

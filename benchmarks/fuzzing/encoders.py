@@ -217,7 +217,7 @@ class Scenario(Bench):
         """Check that grippers are commanded open or closed, and do not switch too often.
 
         `action` [D] is the command of this tick. A gripper may be commanded to a position in between if its command
-        does not change, or if the first command is the one of an e-stop (`stopped`).
+        does not change, or in the first command of all if that is the one of an e-stop (`stopped`).
         """
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]

@@ -1,8 +1,8 @@
-"""RTC: rows that a request declares as fixed must be exactly those that control plans for their steps.
+"""Real-time chunking (RTC): rows that a request declares as fixed must be exactly those that control plans.
 
-A complete station on the virtual clock, a robot that reaches each command at once, and a policy whose answers disagree
-and which either honours the contract of real-time chunking or does not. Answers are late or lost at random, and the run
-is halted, resumed, tuned and restarted.
+A complete station runs on the virtual clock, with a robot that reaches each command at once, and a policy whose answers
+disagree with each other and which either honours the contract of real-time chunking or does not. Answers are late or
+lost at random, and the run is halted, resumed, tuned and restarted.
 """
 
 from __future__ import annotations
@@ -194,8 +194,8 @@ class PrefixKeepingPolicy(Policy):
     def apart(self, row: Float64, at: float, planned: dict[int, Float64], missed: float) -> str:
         """Return as text how a fixed row for control step `at` deviates from the plan, "" if it does not.
 
-        Between two steps the row is compared with their interpolation, with the plan's curvature as tolerance; for
-        poses the error `missed` of inverse kinematics is added.
+        If `at` is between two steps, the row is compared with the interpolation of their planned rows, and the plan's
+        curvature is tolerated. For poses, the error `missed` of inverse kinematics is tolerated too.
         """
         before, part = math.floor(at + _HAIR), at - math.floor(at + _HAIR)
         steps = [before, before + 1] if part > _HAIR else [before]
@@ -293,9 +293,9 @@ class Planned:
     end: int
 
     def arrived_for(self, step: int) -> int:
-        """Return the step from which on the plan is that of the first answer to a request at `step` or later.
+        """Return the step from which on the plan uses an answer to a request that was made at `step` or later.
 
-        Without such an answer, return the end of the run: lost answers fix nothing.
+        If no such answer arrived, return the end of the run: lost answers fix nothing.
         """
         return min((at for observed, at in self.arrived.items() if observed >= step), default=self.end)
 

@@ -1,6 +1,7 @@
-"""On PYTHONPATH: disables measures of runtime.core.realtime listed in EVA_WITHOUT, in control and the bare loop.
+"""On PYTHONPATH: disables the measures of runtime.core.realtime that EVA_WITHOUT lists.
 
-Only for benchmarks.measures: the runtime itself has no such switch.
+Only the control process and the loop of benchmarks.sleeper are affected. Only for benchmarks.measures: the runtime
+itself has no such switch.
 """
 
 import os

@@ -62,7 +62,7 @@ class LabAdminSite(AdminSite):
 class LabelledRows:
     """Mixin of a ModelAdmin with an editable list: each field gets a label for screen readers.
 
-    Without it the fields have none, because Django does not connect them with the column heads.
+    Without this mixin the fields have no labels, because Django does not connect them with the column heads.
     """
 
     def get_changelist_form(self, request: HttpRequest, **named: Any) -> Any:

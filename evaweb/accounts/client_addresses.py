@@ -45,9 +45,9 @@ def _caller(
 ) -> Address | None:
     """Return the client's address: `peer`, unless that is a trusted proxy.
 
-    `named` are forwarded addresses, to which each proxy appends the one that it got the request from. They are followed
-    from the last one backwards as long as the address reached is a trusted proxy's. Those before are ignored, because
-    any client can invent them.
+    `named` are the forwarded addresses of the request: each proxy appends the address from which it got the request.
+    The list is read from its end, as long as the address just read is a trusted proxy's. The entries that are left are
+    ignored, because any client can invent them.
     """
     address = _parsed(peer)
     while named and address is not None and any(address in network for network in proxies):

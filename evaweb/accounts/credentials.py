@@ -1,8 +1,9 @@
-"""Users of sessions and tokens: looked up in the database, cached for when it does not respond.
+"""Users of sessions and tokens, looked up in the database and cached, so that stops work even if it does not respond.
 
-A cached login never expires: stopping works with it as long as this process lives. It is dropped when the database
-disagrees; whenever a cached login is used and older than a few seconds, the database is asked again. Unknown
-credentials are looked up in the share of their client: a flood of invented ones does not delay other clients.
+A cached login never expires: a stop with it works as long as this process lives. The login is removed from the cache
+when the database contradicts it; whenever a cached login is used and older than a few seconds, the database is asked
+again. Lookups of unknown credentials are queued by client, and clients take turns: a flood of invented credentials from
+one client does not delay the others.
 """
 
 from __future__ import annotations
@@ -177,12 +178,12 @@ class CredentialCache:
     async def resolve_presser(self, found: Sequence[Credential], share: str) -> Login | None:
         """Return the user who presses the e-stop, from the cache or else the database.
 
-        None if all credentials in `found` are unknown. An expired session or token is accepted, so that no press is
-        lost to a date.
+        The result is None if all credentials in `found` are unknown. An expired session or token is accepted, so that
+        no press is refused because of a date. `share` identifies the client, whose lookups have a queue of their own.
 
         Raises:
             Unverifiable: The database does not respond.
-            LookupOverload: The database responds, but the share of this client is used up.
+            LookupOverload: The database responds, but lookups of this client are dropped or wait too long.
         """
         for kind, secret in found:
             for remembered in (kind, _of_any_age(kind)):
@@ -202,10 +203,12 @@ class CredentialCache:
                 task.cancel()
 
     async def resolve_stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
-        """Return kind of credential and user of a stop or halt, cached credentials first; None if all are unknown.
+        """Return the kind of the credential and the user who sends a stop or halt; None if all credentials are unknown.
 
-        A cached login is used if the database does not confirm or refute it in time.
-        Raises: Unverifiable, LookupOverload (as `resolve_presser`).
+        Cached credentials in `found` are tried first. A cached login is used if the database neither confirms nor
+        refutes it in time. `share` and the exceptions are those of `resolve_presser`.
+
+        Raises: Unverifiable, LookupOverload.
         """
         fault: LookupOverload | None = None
         for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
@@ -262,10 +265,10 @@ class CredentialCache:
             return self._nobodys.get(key, -float("inf")) > self._clock()
 
     def _check(self, kind: str, secret: str, share: str | None = None) -> Future[Login | None]:
-        """Start a lookup without waiting; further callers share the pending lookup of the same credential and share.
+        """Start a lookup without waiting, or return the pending lookup of the same credential and `share`.
 
-        `share` is None for a credential with a cached login: its lookups have their own threads and do not wait behind
-        those of unknown credentials.
+        `share` identifies the client whose queue the lookup waits in. It is None for a credential with a cached login:
+        such lookups have their own threads and do not wait behind lookups of unknown credentials.
         """
         key = ((kind, digest(secret)), share)
         with self._lock:
@@ -308,7 +311,7 @@ def remaining_wait(came: float, answered: float, now: float) -> float:
 
     Raises:
         Unverifiable: The database has answered no lookup for _PATIENCE_S.
-        LookupOverload: It answers, but other lookups came first for _TURN_S.
+        LookupOverload: The database answers, but the caller's lookup has waited behind others for _TURN_S.
     """
     silent = max(came, answered) + _PATIENCE_S - now
     if silent <= 0:

@@ -25,10 +25,11 @@ class LookupQueueFull(Exception):
 
 
 class FairLookupPool(Generic[T]):
-    """Pool of `threads` that serves shares in turn, each in order of arrival; `submit` never blocks. Thread-safe.
+    """Pool of `threads` threads with one queue per share (usually a client); the queues take turns. Thread-safe.
 
-    Each thread calls `begin` first. If `most` are waiting, the newest work of the longest queue is dropped, or the new
-    work refused: its future fails with LookupQueueFull.
+    `submit` never blocks. Each thread calls `begin` before its first work. At most `most` pieces of work wait: beyond
+    that, either the newest work of the longest queue is dropped, or the new work is refused. The future of the dropped
+    or refused work fails with LookupQueueFull.
     """
 
     def __init__(
@@ -63,9 +64,10 @@ class FairLookupPool(Generic[T]):
         return answer
 
     def _place_for(self, share: Hashable, answer: Future[T]) -> Future[T] | None:
-        """Make room if the queue is full, by removing the newest work of a longer share.
+        """Make room for one more piece of work if the pool is full, by removing the newest work of the longest queue.
 
-        Returns: The future to fail: None if there was room, `answer` if no other share is longer, else the removed one.
+        Returns: The future to fail: None if there was room, `answer` if that of `share` would be the longest queue,
+        else the future of the removed work.
         """
         if self._waiting < self._most:
             return None

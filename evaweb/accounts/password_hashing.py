@@ -1,7 +1,7 @@
 """Password hashing in one low-priority thread, so that many simultaneous logins do not delay a stop.
 
-A hash takes half a second of CPU time. Addresses take turns; if too many logins wait, the address with the most is
-asked to try again.
+A hash takes half a second of CPU time. The client addresses take turns; if too many logins wait, one from the address
+with the most waiting logins is refused, and its user asked to try again.
 """
 
 from __future__ import annotations

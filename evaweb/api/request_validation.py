@@ -1,7 +1,8 @@
 """Validation of query parameters and of request bodies.
 
-Unknown parameters are refused, because a misspelt filter would have no effect. A body is measured and parsed after its
-sender is known, and texts that database or wire cannot represent are refused first.
+Unknown parameters are refused, because a misspelt filter would have no effect. The length of a body is checked, and the
+body parsed, only after its sender is known. Texts that the database or the wire cannot represent are refused before a
+view is called.
 """
 
 from __future__ import annotations

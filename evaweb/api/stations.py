@@ -136,9 +136,10 @@ class LeaseIn(Body):
 
 
 def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
-    """Return `args`. Raise ValueError if they name a trial, which has a field of its own.
+    """Return `args`.
 
-    A run with that field is checked against the trial first, see evaweb.trials.station_commands.
+    Raises: ValueError if `args` has a key `trial`. The command has a field of that name instead: a run with it is
+    checked against the trial first, see evaweb.trials.station_commands.
     """
     if "trial" in args:
         raise ValueError("args name a trial: name it beside them, as `trial`")

@@ -1,8 +1,8 @@
-"""Stops over REST, answered in front of Django: without the database and without a thread of a page.
+"""Stops over REST, answered in front of Django: without waiting for the database or for a thread that serves pages.
 
-Answered here are e-stop, stop and halt of a station, and requests by which a page tests that these would be answered.
-All other requests are passed to the application. The requests are documented in evaweb.api.stations. The gateway runs
-in front of the web, and alone in the process for stops (`stop_application`).
+The gateway answers e-stop, stop and halt of a station. It also answers the requests by which a page tests whether such
+a stop would be answered. All other requests are passed to the application. The requests are documented in
+evaweb.api.stations. The gateway runs in front of the web, and alone in the process for stops (`stop_application`).
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ class Refused(EvaError):
 class StopGateway:
     """ASGI application that answers stops, and passes all other requests to `application`.
 
-    `web_port` is the port of the web whose pages it serves, if it runs in the separate process for stops; else None.
+    In the separate process for stops, `web_port` is the port of the web, whose pages send their stops to this process.
+    In the web itself it is None.
     """
 
     def __init__(self, application: Callable[..., Awaitable[Any]], web_port: int | None = None) -> None:
@@ -164,7 +165,8 @@ class StopGateway:
         ]
 
     def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
-        """Return the scope of a request, with this port as its origin if one of the web's pages sent it.
+        """Return `scope`; if one of the web's pages sent the request, its Origin header is replaced by this server's
+        origin.
 
         Django's CSRF check accepts only one origin, that of the port where the request arrives.
         """
@@ -242,12 +244,12 @@ def _answer_body(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> di
 
 
 async def _resolve_presser(scope: dict[str, Any]) -> Login:
-    """Return the login of the client that presses, by any of its credentials.
+    """Return the login of the client that presses the e-stop, by any of its credentials.
 
     Raises:
-        Refused: If they are missing or unknown.
+        Refused: If the credentials are missing or unknown.
         Unverifiable: If the database does not answer.
-        LookupOverload: If this client's share of lookups is used up.
+        LookupOverload: If lookups of this client are dropped or wait too long.
     """
     candidates = _credentials(scope)
     login = await credentials.resolve_presser(candidates, client_key(scope))
@@ -257,11 +259,11 @@ async def _resolve_presser(scope: dict[str, Any]) -> Login:
 
 
 async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
-    """Return the kind of credential and the login of the client that stops.
+    """Return the kind of credential and the login of the client that sends a stop or halt.
 
     Raises:
-        Refused: If they are missing, unknown, or cannot be verified.
-        LookupOverload: If this client's share of lookups is used up.
+        Refused: If the credentials are missing, unknown, or cannot be verified.
+        LookupOverload: If lookups of this client are dropped or wait too long.
     """
     candidates = _credentials(scope)
     try:

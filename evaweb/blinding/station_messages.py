@@ -1,8 +1,9 @@
 """Redaction of a station's messages for users from whom a checkpoint is hidden: only what they need to act remains.
 
-A message is shown if its id is listed here, with all arguments that are names and numbers of robot, cameras or people,
-or messages that are shown themselves. A refusal by safety is reduced to the limit, without the policy's values.
-Everything else is hidden, also foreign text within a message: a fault may name a server.
+A message is shown if this module lists its id and each of its arguments may be shown: a name or number that belongs to
+the robot, the cameras or people, or a nested message that may itself be shown. A refusal by safety is reduced to the
+limit, without the policy's values. Every other message is hidden, and so is any message that contains foreign text,
+because a fault may name a server.
 """
 
 from __future__ import annotations

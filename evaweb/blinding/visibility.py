@@ -56,10 +56,10 @@ class Visibility:
 
     Attributes:
         checkpoints: Ids of the hidden checkpoints.
-        names: Their names.
-        stations: Names of stations at which a trial of a plan that is blind for the user was handed out.
+        names: Names of the hidden checkpoints.
+        stations: Names of stations that have been handed a trial of a plan that is blind for the user.
         busy_stations: Names of stations with an unfinished trial of such a plan.
-        keys: Ids of these plans.
+        keys: Ids of the plans that are blind for the user.
         plans: Titles of these plans as text.
         user: Id of the account, None without an account.
     """
@@ -80,7 +80,7 @@ class Visibility:
     def hides_plan(self, plan: Any) -> bool:
         """Return True if the plan's checkpoints are hidden, and with them its question, digest and amendments.
 
-        The draft of an amendment reveals the same as the plan that it amends.
+        The draft of an amendment is hidden like the plan that it amends, because it reveals the same.
         """
         return plan.pk in self.keys or (plan.state == "draft" and plan.amends_id in self.keys)
 

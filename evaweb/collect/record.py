@@ -38,8 +38,8 @@ class EventLine(Line):
     def written(cls, row: SessionEvent, **given: Any) -> dict[str, Any]:
         """Return the line of an event that is about to be saved.
 
-        The line of `opened` has all values of the session, that of `target` only the target; other kinds have none of
-        them.
+        The line of an event of kind `opened` has all values of the session. That of kind `target` has the session's
+        target only; lines of other kinds have no values of the session.
         """
         without = {"opened": (), "target": _OPENED}.get(row.kind, ("target", *_OPENED))
         return {name: value for name, value in super().written(row).items() if name not in without}

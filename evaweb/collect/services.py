@@ -85,10 +85,14 @@ _ROLLOUTS = "rollouts"  # reserved prefix of datasets with policies' runs
 def open_session(
     *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
 ) -> CollectSession:
-    """Open a session with the station's present set-up; for operators, while no other user commands the station.
+    """Open a session with the station's present set-up.
 
-    `dataset` "" selects the deployment's own. Raises: Conflict if a session is open at the station, or the dataset was
-    collected with another set-up; SetupChanged lists every difference.
+    The user must be an operator, and no other user may command the station. If `dataset` is "", the session uses the
+    deployment's dataset.
+
+    Raises:
+        Conflict: A session is open at the station.
+        SetupChanged: The dataset was collected with another set-up; the message lists every difference.
     """
     require_role(user, Role.OPERATOR)
     task = clean_text("task", task, LONGEST_TASK)
@@ -173,10 +177,12 @@ def publish_session(
     results: Sequence[str] = selectors.PUBLISHED_RESULTS,
     version: str = "",
 ) -> list[Job]:
-    """Queue the publication of the accepted episodes with these results that are in no dataset yet.
+    """Queue the publication of the session's accepted episodes that are in no dataset yet, and return the jobs.
 
-    `version` is the version of a new dataset. "" selects the version of the existing dataset or, for a new one, the
-    default. Raises: Conflict if there is nothing to publish, or the dataset has another version.
+    Only episodes with one of the `results` are published. `version` is the version of a new dataset; "" selects the
+    version of the existing dataset or, for a new one, the default.
+
+    Raises: Conflict if there is nothing to publish, or the dataset has another version.
     """
     require_role(user, Role.OPERATOR)
     allowed = [result.value for result in Result if result.value]

@@ -43,10 +43,13 @@ def session_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Send a command for a session; the further arguments are those of `issue_command`.
+    """Send a command for a session.
 
-    `setup` and `run` get task and session from it. Before each run the station's set-up is compared with the session's.
-    Never call it within a transaction. After an accepted run its episode has a row. Raises: SetupChanged.
+    The commands `setup` and `run` get task and session from `session`; `given` are further arguments of
+    `issue_command`. Before each run the station's set-up is compared with the session's. After an accepted run, the
+    database has a row for its episode. Never call this within a transaction.
+
+    Raises: SetupChanged if the set-ups differ.
     """
     require_role(user, Role.OPERATOR)
     identity = parse_command_uuid(uuid)

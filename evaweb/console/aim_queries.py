@@ -96,8 +96,8 @@ def query_aim(
 ) -> dict[str, Any]:
     """Return the station's answer about a target, as JSON.
 
-    `links` [P * 16] in it are the poses of the parts of `looks`, the robot as drawn, at that target; [] if there are
-    none.
+    The answer also has a key "links" [P * 16]: the poses that the parts of `looks`, the robot as drawn, have at the
+    target. The list is empty if the robot is not drawn or the station gave no joints.
     """
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:

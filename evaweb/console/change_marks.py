@@ -1,7 +1,7 @@
 """Detection of changes in a station's database rows, whichever process made them.
 
-Each web process polls once per second while a page is open. This needs no message channel to workers and other
-processes except the database.
+Each web process polls the database once per second while a page is open, so that workers and other processes need no
+further message channel to it.
 """
 
 from __future__ import annotations

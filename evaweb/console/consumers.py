@@ -1,8 +1,8 @@
 """Live socket of a page at a station.
 
-Watching needs the database once, when the socket opens. Renewing a lease and stopping never need it: they have their
-own threads and go directly to the runtime, and stops are obeyed even before the database has named the user. In
-parallel the login is checked every few seconds: a user who has logged out, or is no longer an operator, loses the
+Watching needs the database once, when the socket opens. Renewing a lease and stopping never need the database: they
+have their own threads and go directly to the runtime, and stops are obeyed even before the database has named the user.
+In parallel the login is checked every few seconds: a user who has logged out, or is no longer an operator, loses the
 lease.
 """
 

@@ -24,9 +24,12 @@ _WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap", "ik")
 def encode_chunk(content: Mapping[str, Any], looks: DrawnRobot | None, now: float) -> EncodedPart:
     """Return the part of stream `chunk` for pages; {"chunk": 0} if there is no chunk.
 
-    In addition to the station's own keys: `targets` [H], the step of each row (-1: not executed), and `ghost_rows` [N],
-    the rows drawn as robots. Arrays: `tips` float32 [H, arms, 3], fingertip positions of each row [m, world]; `ghost`
-    float32 [N, P, 16], only of a proposed chunk. Both are omitted if the robot is not drawn.
+    The part has the station's own keys and these:
+
+    * `targets` [H]: step at which each row is executed (-1: not executed).
+    * `tips` float32 [H, arms, 3]: fingertip positions of each row [m, world]; omitted if the robot is not drawn.
+    * `ghost_rows` [N]: rows of a proposed chunk that are drawn as robots.
+    * `ghost` float32 [N, P, 16]: poses of the robot's parts in these rows; omitted like `tips`.
     """
     facts: dict[str, Any] = {key: content[key] for key in _WORDS if key in content}
     rows = np.asarray(content.get("rows", np.empty((0, 0))), np.float64)
@@ -56,9 +59,10 @@ _VECTORS = (
 
 
 class StreamEncoder:
-    """Encoder of feed messages into parts; `looks` is the robot with the station's groups, None if it is not drawn.
+    """Encoder of feed messages into parts; `looks` is the robot as drawn, None if it is not drawn.
 
-    With `veiled` the parts are for users from whom the policy is hidden; the snapshots must already be redacted.
+    The robot is drawn with the groups of joints that the station reports. With `veiled` the parts are for users from
+    whom the policy is hidden; the snapshots must already be redacted.
     """
 
     def __init__(self, robot: str, *, veiled: bool = False) -> None:

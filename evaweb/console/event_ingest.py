@@ -122,10 +122,10 @@ class StationEventIngester:
 
 
 def ingest_events(*, station: Station, history: History, state: str = "") -> tuple[str, int]:
-    """Pass all new events to the services; return boot and number of the last event.
+    """Pass all new events to the services; return the boot id and number of the last event.
 
-    A new boot begins with a synthetic event that carries the station's state, because the station may emit no event of
-    its own for a long time.
+    If the runtime has restarted, the first event passed on is a synthetic one with the station's `state`, because the
+    restarted station may emit no event of its own for a long time.
     """
     if station.boot != history.boot:
         if station.boot and state:

@@ -227,9 +227,10 @@ class StationFeed:
         self._pictures: _Reader | None = None
 
     def subscribe(self, listener: Listener, *, pictures: bool) -> None:
-        """Call `listener` with the known values, then with every message; the first listener starts the threads.
+        """Call `listener` with the values that are known now, then with every message.
 
-        Images, joints and chunks are read only while at least one listener has set `pictures`.
+        The first listener starts the threads. Images, joints and chunks are read only while there is a listener that
+        was subscribed with `pictures`.
         """
         with self._lock:
             self._listeners[listener] = pictures

@@ -26,8 +26,9 @@ _CHANGES_S = 1.0
 class StationRoom:
     """Pages that watch one station. Everything except `on_message` belongs to the event loop.
 
-    Users from whom the station's checkpoint is hidden receive redacted parts. Visibilities are queried every second.
-    New events are held back until the next answer, because a trial may have been allocated since the last one.
+    Users from whom the station's checkpoint is hidden receive redacted parts. The users' visibilities are queried every
+    second. New events are held back until the next such query is answered, because a trial that hides a checkpoint may
+    have been allocated since the previous one.
     """
 
     def __init__(self, station: str, robot: str, loop: asyncio.AbstractEventLoop, heard: Feeds) -> None:

@@ -26,8 +26,9 @@ MakeFrame = Callable[[Iterable[EncodedPart]], bytes]
 class Mailbox:
     """Messages of one page at one station; for the event loop only.
 
-    `veiled` is True if `user` must not see which checkpoint the station is set up for; `redacts_events` is True if its
-    events must be redacted for that user. Both follow from `sight`.
+    `sight` is the visibility of the page's user, from which two attributes follow. `veiled` is True if the user must
+    not see which checkpoint the station is set up for; `redacts_events` is True if the station's events must be
+    redacted for the user.
     """
 
     def __init__(self, deliver: Deliver, user: Any = None) -> None:

@@ -1,6 +1,7 @@
-"""Stops by a page: executed at once if the user is known, and even if the database cannot name the user.
+"""Stops by a page: executed at once if the user is known.
 
-Nothing here waits for the database, and the number of presses is not limited.
+If the user is not known yet, the credentials are resolved first; an e-stop is executed even if the database cannot do
+that. Once the user is known, nothing here waits for the database. The number of presses is not limited.
 """
 
 from __future__ import annotations

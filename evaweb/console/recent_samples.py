@@ -31,12 +31,23 @@ class _Sample:
 
 
 class RecentSamples:
-    """Builder of stream `recent`: the newest samples in columns, oldest first; `t` is on this process's clock [s].
+    """Builder of stream `recent`: the newest samples, oldest first. Consecutive parts overlap.
 
-    Arrays float32 [K, D]: `measured`; `raw`, the newest chunk; `planned`, the merged plan; `executed`, sent to the
-    robot or, in simulation, to the simulated robot. Missing values are NaN. Columns per sample: `step`, the leading
-    `chunk` (-1: no chunk, 0: hold target), the number of `chunks` that contributed, whether safety `limited` it, and
-    whether the executing robot was `simulated`. Consecutive parts overlap.
+    Each part has these arrays float32 [K, D], in which missing values are NaN:
+
+    * `measured`: the measured joints.
+    * `raw`: the rows of the newest chunk.
+    * `planned`: the merged plan.
+    * `executed`: commands sent to the robot or, in simulation, to the simulated robot.
+
+    It also has lists with one value per sample:
+
+    * `t`: time on this process's clock [s].
+    * `step`: control step.
+    * `chunk`: the chunk with the largest weight (-1: no chunk, 0: hold target).
+    * `chunks`: number of chunks that contributed.
+    * `limited`: whether safety limited the command.
+    * `simulated`: whether the executing robot was simulated.
     """
 
     def __init__(self) -> None:

@@ -36,12 +36,18 @@ class StationRow:
 class EvalPanel:
     """Contents of the four steps of an evaluation, as visible to one user.
 
-    `trial` is the unfinished trial, with the `milestones` of its scene; `failures` are the possible failure levels, and
-    `set_up` is whether the station was last set up for that trial. Without a trial, `scene`, `position` and
-    `checkpoint` are the initial choice, which follows from `last`, the newest finished trial. `plans` are the plans
-    open here, `plan` is the selected one, `handout` the trial's allocation, and `cameras` this user's camera check
-    while it is valid. `views` are the reference images by camera: those of the trial's position or, without a trial, of
-    the camera.
+    Attributes:
+        trial: The unfinished trial.
+        last: The newest finished trial.
+        scene, position, checkpoint: Without an unfinished trial, the initial choice, which follows from `last`.
+        milestones: Milestones of the trial's scene.
+        set_up: Whether the station was last set up for the unfinished trial.
+        failures: Phases and causes of failure that can be selected.
+        plans: Plans that are open at this station.
+        plan: The selected plan.
+        handout: Allocation of the trial by its plan.
+        cameras: The user's camera check while it is valid.
+        views: Reference images by camera: those of the trial's position or, without a trial, of the camera.
     """
 
     station: Station
@@ -196,9 +202,10 @@ def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:
 
 
 def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Position | None:
-    """Return the position after the last trial's; the same position again if that trial has no score.
+    """Return the position that follows that of the trial `last`; after the last position, the first.
 
-    The first position without a last trial, None if the scene has no positions.
+    If `last` has no score, its own position is returned. If `last` is None, or its position is not among `positions`,
+    the first position is returned. The result is None if there are no positions.
     """
     if not positions:
         return None

@@ -24,7 +24,7 @@ _turns: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 
 def still_of(station: Station) -> bytes:
-    """Return a JPEG of the station's first camera that was requested at most KEPT_S [s] ago.
+    """Return a JPEG of the station's first camera; the image was requested at most KEPT_S [s] ago.
 
     Raises:
         NotFound: If the station does not run, has no camera or sends no image.

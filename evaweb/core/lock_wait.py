@@ -53,9 +53,10 @@ def short_lock_wait(seconds: float = HURRY_S) -> Iterator[None]:
 
 @contextmanager
 def lock_wait(seconds: float) -> Iterator[None]:
-    """Limit lock waits of the current connection to `seconds` [s]; then it raises OperationalError.
+    """Limit the time that a statement of the current connection waits for a lock to `seconds` [s].
 
-    SQLite locks the whole database. PostgreSQL locks rows, and an insert waits for the rows that it references.
+    A statement that would wait longer raises OperationalError. SQLite locks the whole database. PostgreSQL locks rows,
+    and an insert waits for the rows that it references.
     """
     _wait_at_most(connection, seconds if connection.vendor == "sqlite" else max(seconds, 0.001))
     try:

@@ -1,6 +1,6 @@
 """Stores of large immutable files: objects named by their SHA-256, in a folder or an S3-compatible bucket.
 
-Both implement `Store`. Code that needs a local file gets it from `LocalCache`, which checks the digest.
+Both kinds of store implement `Store`. Code that needs a local file gets it from `LocalCache`, which checks the digest.
 The S3 client is obstore (MIT), the Python binding of Apache Arrow's object_store in Rust: one wheel of 6 MB that
 depends only on typing_extensions, with signed URLs, multipart uploads and retries. boto3 brings four packages and the
 tables of all of Amazon's services; django-storages is a layer above it for model fields, which these files are not.

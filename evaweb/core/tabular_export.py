@@ -58,7 +58,7 @@ def _lines(rows: Iterable[Sequence[str]]) -> str:
 
 
 def iter_parquet(columns: Mapping[str, Any], pages: Pages) -> Iterator[bytes]:
-    """Yield a Parquet file with one row group per page; `columns` maps names to types: `int | None`, `str`.
+    """Yield a Parquet file with one row group per page; `columns` maps names to types such as `str` and `int | None`.
 
     Texts, enumerations and values of any other type become strings; times are UTC in microseconds.
     """

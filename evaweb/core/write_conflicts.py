@@ -1,7 +1,8 @@
-"""Concurrent writes of the same key: the loser gets a clear message or a second attempt instead of a server error.
+"""Concurrent writes of the same key: the writer that is refused gets a clear message or a second attempt.
 
-SQLite admits one writer at a time. On PostgreSQL two transactions can both check that a name is free and insert it;
-the unique index then refuses the second one, after every check.
+Without this module the refusal would be a server error. SQLite admits one writer at a time. On PostgreSQL two
+transactions can both check that a name is free and insert it; the unique index then refuses the second one, after every
+check.
 """
 
 from __future__ import annotations

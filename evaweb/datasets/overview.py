@@ -98,9 +98,10 @@ def dataset_names() -> list[str]:
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """Yield the dataset folders below `folder`; hidden folders are skipped: they are drafts, or remains of a crash.
+    """Yield the dataset folders below `folder`.
 
-    Folders with names that no URL can carry are skipped too: one of them would break the whole list.
+    Hidden folders are skipped, because they are drafts or remains of a crash. Folders with names that no URL can carry
+    are skipped too: one of them would break the whole list.
     """
     try:
         below = [Path(entry.path) for entry in os.scandir(folder) if entry.is_dir()]

@@ -165,8 +165,8 @@ def as_recording(shown: PlayedEpisode) -> Episode:
     """Return the episode with the tables of a recording, so that it can be played like one.
 
     If a sidecar has the raw, smoothed and executed action streams, they are included. If state and action have
-    different dimensions, all of them become joints: first those of the state, then those of the action; the measured
-    values of the latter, and the commanded values of the former, are NaN.
+    different dimensions, the joints of the result are first the dimensions of the state, then those of the action: the
+    dimensions of the state have no commanded values (NaN), those of the action no measured values (NaN).
     Raises: RecordingError.
     """
     table = shown.dataset.table(shown.index)

@@ -163,11 +163,13 @@ def replay_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Set a station up to play an episode, given by uuid or DATASET:INDEX.
+    """Send the command `setup`, which prepares a station to play an episode.
 
-    The further arguments are those of `issue_command`.
+    `episode` is a uuid or DATASET:INDEX. `given` are further arguments of `issue_command`.
 
-    Raises: EvaError for other commands; Conflict if the station's robot is not the episode's.
+    Raises:
+        EvaError: `kind` is not "setup".
+        Conflict: The station's robot is not the episode's.
     """
     require_role(user, Role.OPERATOR)
     if kind != "setup":

@@ -11,10 +11,10 @@ from runtime.recording.reader import Episode, open_episode
 
 
 def bench_course(folder: Path) -> list[dict[str, Any]]:
-    """Return the positions of the objects, [{row, blocks, plate}] at each row where they changed.
+    """Return the positions of the objects as [{row, blocks, plate}], one entry for each row where a position changed.
 
-    Outcomes are left out. [] for a recording without simulated bench. Raises: RecordingError, which names the absent or
-    damaged file.
+    The outcome of the run is omitted. The list is empty for a recording without simulated bench. Raises:
+    RecordingError, which names the absent or damaged file.
     """
     course: list[dict[str, Any]] = []
     for row, change in truth_changes(open_episode(folder).rows):

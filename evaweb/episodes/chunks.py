@@ -18,9 +18,14 @@ UNKNOWN = -1
 def chunk_arrays(episode: Episode, times_of: Callable[[Array], Array]) -> Stream:
     """Return every chunk of the episode as a stream; `times_of` maps control steps to times [s].
 
-    Arrays [C]: id i4; observed and arrived f8 [s] (NaN: never arrived); delay, mistimed and overlap i4 [steps];
-    rows i4, the number of rows; first and last i4, the planned rows; strategy i4, index into the list `strategies`;
-    inference f4 [ms]. -1 means unknown or none: older episodes have no overlap and no strategy.
+    The stream has the list `strategies` and these arrays [C], in which -1 means unknown or none (older episodes have no
+    overlap and no strategy):
+
+    * id i4; rows i4: number of rows; first and last i4: the planned rows.
+    * observed and arrived f8: times of the observation and of the arrival [s] (NaN: never arrived).
+    * delay, mistimed and overlap i4 [steps].
+    * strategy i4: index into `strategies`.
+    * inference f4 [ms].
     """
     raw = episode.raw
     numbers, firsts, counts = np.unique(

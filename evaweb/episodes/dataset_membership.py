@@ -33,9 +33,9 @@ class Membership:
 def sync_memberships() -> list[str]:
     """Update the rows of episodes with the dataset that contains them, or with no dataset.
 
-    If several datasets contain an episode, one to which it was published is preferred to copies; then a scored one;
-    then the one recorded so far. Unreadable datasets are returned as messages, and rows that refer to them are
-    unchanged.
+    If several datasets contain an episode, one to which it was published is preferred to copies. Among these, a dataset
+    of scored episodes is preferred, and then the dataset that the row names already. Unreadable datasets are returned
+    as messages, and rows that refer to them are unchanged.
     """
     places: dict[UUID, list[Membership]] = defaultdict(list)
     problems, unread = [], set()

@@ -14,8 +14,8 @@ _givers: list[SidecarWriter] = []
 def register_sidecar_writer(function: SidecarWriter) -> SidecarWriter:
     """Register a function that writes sidecar files and returns them by kind.
 
-    Apps of higher layers call this in `ready`. The function gets the episode's uuid and a folder of its own, and writes
-    JSON Lines there.
+    Apps of higher layers call this when Django starts (`AppConfig.ready`). The registered function gets the episode's
+    uuid and a folder of its own, and writes JSON Lines there.
     """
     if function not in _givers:
         _givers.append(function)

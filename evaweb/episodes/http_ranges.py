@@ -44,8 +44,8 @@ class Unsatisfiable(Exception):
 def requested_range(header: str | None, size: int) -> Span | None:
     """Return the single range that `header` requests.
 
-    None without a range, for several ranges or a malformed header: then the whole file is the answer, which section
-    14.2 permits. Raises: Unsatisfiable.
+    The result is None without a range, and also for several ranges or a malformed header: then the whole file is the
+    answer, which section 14.2 of RFC 9110 permits. Raises: Unsatisfiable.
     """
     match = _RANGE.fullmatch(header or "")
     if not match or match[1] == match[2] == "" or max(len(match[1]), len(match[2])) > _DIGITS:

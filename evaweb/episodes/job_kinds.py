@@ -88,9 +88,10 @@ def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
 
 @job_kind("publish")
 def publish_episode(work: JobContext) -> Mapping[str, Any]:
-    """Write the episode into its dataset with the success of its newest score; args: uuid, version of a new dataset.
+    """Write the episode into its dataset, with the success of its newest score.
 
-    An interrupted episode is published only if it was scored, a discarded one never.
+    The args of the job are the `uuid` of the episode and the `version` of a new dataset. An interrupted episode is
+    published only if it was scored, a discarded one never.
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)

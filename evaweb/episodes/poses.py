@@ -24,7 +24,8 @@ MOST_ROWS = 900  # rows per response: half a minute at 30 Hz
 def pose_message(folder: Path, first: int) -> bytes:
     """Return a message of evaweb.core.binary_frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
 
-    Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints.
+    The poses are computed from the measured joints of at most MOST_ROWS rows of the recording, beginning with row
+    `first`.
     Raises: NotFound for an unknown robot or row; RecordingError, which names the absent or damaged file.
     """
     return pose_streams(open_episode(folder), first)

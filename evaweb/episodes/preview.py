@@ -28,7 +28,8 @@ QUALITY = 82
 def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> int:
     """Write <camera>.mp4 and <camera>.sheet.jpg of every camera with images, and thumbnail.jpg, to `target`.
 
-    The folder appears as a whole, and replaces an older one. `tell` receives progress messages.
+    The folder `target` appears only when all files are complete, and replaces an older one. `tell` receives progress
+    messages.
     Returns: The number of rows.
     Raises: RecordingError, which names the file that is absent, damaged or cannot be written.
     """

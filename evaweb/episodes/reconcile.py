@@ -50,8 +50,9 @@ _restorers: list[Restorer] = []
 def register_restorer(function: Restorer) -> Restorer:
     """Register a function that restores rows from scores files and manifests.
 
-    Apps of higher layers call this in `ready`. The function is called once per run, after earlier restorers, creates
-    missing rows and returns their number. It raises EvaError if a run cannot be restored.
+    Apps of higher layers call this when Django starts (`AppConfig.ready`). The registered function is called once per
+    run, after earlier restorers; it creates missing rows and returns their number. It raises EvaError if a run cannot
+    be restored.
     """
     if function not in _restorers:
         _restorers.append(function)

@@ -79,8 +79,9 @@ def _require_own(station: Station, uuid: UUID) -> None:
 def record_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
     """Read an episode that the station reports as closed, and queue its preview.
 
-    `data` of the runtime's event: uuid, status, reason, rows, error, waits. If the folder is not on this machine or
-    damaged, the values of the event are stored. Raises: EvaError for an invalid uuid, or another station's episode.
+    `data` are the data of the runtime's event, with the keys uuid, status, reason, rows, error and waits. If the folder
+    is damaged or not on this machine, the values of the event are stored. Raises: EvaError for an invalid uuid, or
+    another station's episode.
     """
     uuid = _uuid(data.get("uuid"))
     _require_own(station, uuid)
@@ -127,11 +128,11 @@ def create_missing_episode(*, station: Station, uuid: UUID, **facts: Any) -> Epi
 
 @transaction.atomic
 def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
-    """Update the row from the folder, and queue a preview if there is something to play.
+    """Update the episode's row from its folder, and queue a preview if there is something to play.
 
-    Raises: RecordingError if the folder is absent or damaged, or has another outcome than the one with which the
-    recording was closed. The row is then unchanged; after a changed outcome the recording is among the next to be
-    verified.
+    Raises: RecordingError if the folder is absent or damaged, or if its outcome file is not the one with which the
+    recording was closed. The row is then unchanged, except that a recording with another outcome file is verified again
+    soon.
     """
     recorded = read_recorded_episode(journal_folder(uuid))
     row = Episode.objects.filter(uuid=uuid, status__in=CLOSED).first()

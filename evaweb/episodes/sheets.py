@@ -21,7 +21,7 @@ QUALITY = 70
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Layout of a sheet of `across` x `down` tiles, which follow each other as in a text.
+    """Layout of a sheet of `across` x `down` tiles, which are filled row by row from the top left.
 
     Tile k shows one image of `every` consecutive rows of the episode, the first of which is k * `every`.
     """

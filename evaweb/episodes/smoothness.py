@@ -1,10 +1,10 @@
 """Smoothness of the arms in a run: SPARC of the speed of each end effector, measured and commanded.
 
 SPARC was made for the speed of a hand (Balasubramanian et al. 2015), and is comparable between robots with different
-joints. Positions are computed from the joints by the robot's description, while the robot was asked to move: a robot
-held for its operator is not jerky. The result of a run is the value of the measured motion, at capture times. The value
-of the commanded motion is reported in addition: it is free of sensor noise and of smoothing by the robot's own
-controller.
+joints. Positions are computed from the joints by the robot's description, and only for times in which the robot was
+asked to move: a robot held for its operator is not jerky. The result of a run is the value of the measured motion, at
+capture times. The value of the commanded motion is reported in addition: it is free of sensor noise and of smoothing by
+the robot's own controller.
 """
 
 from __future__ import annotations
@@ -114,7 +114,8 @@ class _Samples:
 class _TipTrack:
     """Positions of all end effectors [steps, arms, 3] at the control rate, one span per uninterrupted motion.
 
-    They are linearly interpolated between samples. `seen` is the number of samples per second, None without samples.
+    The positions are linearly interpolated between samples. `seen` is the number of samples per second, None without
+    samples.
     """
 
     spans: tuple[Array, ...]

@@ -41,7 +41,8 @@ async def file_answer(
 ) -> HttpResponseBase:
     """Return the file, the requested range of it, or status 304.
 
-    With a `name` it is a download. Neither `path` nor `name` may come from the client. Raises: NotFound if absent.
+    With a `name` it is a download. Neither `path` nor `name` may come from the client. Raises: NotFound if there is no
+    such file.
     """
     if request.method not in ("GET", "HEAD"):
         return HttpResponseNotAllowed(["GET", "HEAD"])

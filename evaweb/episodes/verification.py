@@ -88,7 +88,8 @@ def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
 def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
     """Return `verdict`, or "damaged" in its place if the row contradicts it.
 
-    That is the case if the row is that of a closed recording, and the outcome on the disk is absent or another one.
+    The row contradicts it if the recording is closed according to the row, but the outcome file on the disk is absent
+    or another one.
     """
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict

@@ -25,7 +25,7 @@ class Heartbeat:
     """Context manager that calls `beat` every `period_s` [s] until the block ends or `beat` returns False.
 
     It has its own database connection. If a beat fails, that is logged and the next one is tried; the block continues
-    meanwhile. If beats fail for too long, other workers reclaim the job, and `lapse` runs before that.
+    meanwhile. If beats fail for so long that other workers would soon reclaim the job, `lapse` is called.
     """
 
     def __init__(self, beat: Callable[[], bool], period_s: float, lapse: Lapse | None = None) -> None:

@@ -25,7 +25,8 @@ class Queue(StrEnum):
 class JobContext:
     """Context of one job for the function of its kind: arguments and progress reports.
 
-    `hold` waits until no other job holds any of the given names, and then holds them instead of its earlier ones.
+    `hold` waits until no other job holds any of the given names; from then on this job holds them, and releases the
+    names that it held before.
     """
 
     args: Args
@@ -74,15 +75,17 @@ class UnknownKind(EvaError):
 def job_kind(
     name: str, least: Least = _operators, *, queue: Queue = Queue.CPU, folder: bool = True
 ) -> Callable[[Kind], Kind]:
-    """Declare a kind: decorate a function that does the job and returns its result as JSON.
+    """Declare a kind of jobs: decorate the function that does such a job and returns its result as JSON.
 
-    It may be killed at any moment and run again, in the worst case by several workers at once: it must be idempotent.
-    An exception becomes the error of the job, which is retried.
+    The function may be killed at any moment and run again, in the worst case by several workers at once: it must be
+    idempotent. An exception becomes the error of the job, which is retried.
 
     Args:
-        least: Role that may request a job with the given args.
-        queue: Queue of workers that execute it.
-        folder: Whether it needs the lab's data folder, because it accesses recordings, datasets or records in place.
+        name: Name of the kind.
+        least: Function that returns the role that may request a job with the given args.
+        queue: Queue of workers that execute such jobs.
+        folder: Whether such a job needs the lab's data folder, because it accesses recordings, datasets or records in
+            place.
     """
 
     def declare(function: Kind) -> Kind:

@@ -101,8 +101,8 @@ def _done_since() -> Q:
 def pace_of(job: Job, now: datetime | None = None) -> Pace:
     """Return the estimated progress of a running job.
 
-    The estimate is from the steps that the job reports ("n of m") and their rate so far; without such steps it is from
-    the median duration of the last jobs of its kind.
+    The progress is computed from the steps that the job reports ("n of m") and their rate so far; without such steps,
+    from the median duration of the last jobs of the same kind.
     """
     if job.status != JobStatus.RUNNING or job.claimed_at is None:
         return Pace()

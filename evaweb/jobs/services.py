@@ -192,7 +192,7 @@ def _lapsed(job: Job) -> None:
 def hold(job: Job, names: Collection[str]) -> None:
     """Wait until no other running job holds any of `names`, then hold them until this job ends.
 
-    They replace its earlier holds, so that two jobs cannot deadlock. Raises: JobTakenOver, Cancelled.
+    They replace the names that this job held before, so that two jobs cannot deadlock. Raises: JobTakenOver, Cancelled.
     """
     while (by := retry_while_locked(partial(_acquire_names, job, sorted(set(names))))) is not None:
         _tell(job, f"waits for another job at work on the same: {by}")

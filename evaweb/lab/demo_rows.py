@@ -123,10 +123,11 @@ def demo_plan(
 ) -> Plan:
     """Return a frozen blind plan that compares two checkpoints at all positions of a scene.
 
-    It is created, or amended if there is one by that name.
+    A plan with this name that exists already is returned instead, amended first if it is frozen and its checkpoints
+    have changed since. If it is closed or revealed, it stays so.
 
     Raises:
-        Conflict: If it cannot be amended, because trials are not finished.
+        Conflict: If the existing plan cannot be amended, because some of its trials are not finished.
     """
     user = User.objects.get(username=owner)
     plan = Plan.objects.filter(name=name).order_by("-version").first()

@@ -274,7 +274,7 @@ def remove(*, name: str) -> None:
     A station without any history or plan is deleted too; any other is deactivated.
 
     Raises:
-        NotFound: If there is none.
+        NotFound: If there is no deployment of that name.
         Conflict: If the station is in use.
     """
     stored = stored_deployment(name)
@@ -373,10 +373,10 @@ def _put(
 ) -> None:
     """Write `tree` as a deployment file to `path`, if the runtime can load it.
 
-    `about` are lines of the comment at its head. `place` moves the checked draft to `path`.
+    `about` are lines of the comment at the head of the file. `place` moves the checked draft to `path`.
 
     Raises:
-        EvaError: If it cannot be loaded.
+        EvaError: If the runtime cannot load the file.
     """
     written = (
         f"Written by First steps, {timezone.localtime():%Y-%m-%d %H:%M}. Every key: docs/configuration.md."

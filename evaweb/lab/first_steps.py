@@ -53,10 +53,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Walk:
-    """First steps of one station, or of a lab without a station, where the first step is the current one.
+    """First steps of one station.
 
-    `snapshot` is the station's state, {} if it does not answer; `kept` is its deployment file, and `standing` the
-    status of that deployment in the lab.
+    Without a station they are those of a lab in which the first step is the current one. `snapshot` is the station's
+    state, {} if the station does not answer; `kept` is its deployment file, and `standing` the status of that
+    deployment in the lab.
     """
 
     station: Station | None

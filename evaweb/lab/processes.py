@@ -82,8 +82,8 @@ class ChildProcesses:
         """Start a program and wait until it is ready; return the addresses that it announces, {} if none.
 
         Raises:
-            LabError: If it makes no progress for `ready_s` [s], uses too much processor time, or fails. Slow
-                machines are waited for.
+            LabError: If the program makes no progress for `ready_s` [s], uses too much processor time, or fails. On a
+                slow machine, a program that makes progress is waited for.
         """
         return self.begin(program, ready_s)()
 

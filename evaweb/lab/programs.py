@@ -138,8 +138,8 @@ def lockstep(
 ) -> ProgramSpec:
     """Return the program of a station, its simulated bench and its policy servers in one process on a virtual clock.
 
-    `policies` maps names to options and port (0: free); the addresses are announced. `options` are those of the bench,
-    and --paced.
+    `policies` maps the name of each policy server to its options and port (0: free); the program announces the servers'
+    addresses. `options` are those of the bench, and may include --paced.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     served = [

@@ -190,7 +190,7 @@ class LivePage:
     ) -> Mapping[str, Any]:
         """Return the first state that satisfies `reached`.
 
-        After a command only newer states count: an old `ready` is not an answer to `setup`.
+        After a command only newer states count: a state "ready" from before is not an answer to the command "setup".
 
         Raises:
             StateTimeout: If there is none within `seconds` [s].

@@ -77,7 +77,7 @@ def bring(
     """Start bench and policies of a station step by step; yield the name of each as it is started.
 
     Returns the assignments that override the station's deployment. A policy server is shared by all stations with this
-    robot; its checkpoint is updated with its address.
+    robot. The checkpoint of the server is created, or updated with the server's address.
     """
     program = programs.tabletop(robot, how.options, f"bench-{station}")
     node = yield from _starting(processes, program, "the simulated bench")

@@ -190,7 +190,9 @@ def _published(visitor: RestClient, episode: str) -> Mapping[str, Any]:
 
 
 def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], label: str) -> Mapping[str, Any]:
-    """Return the episode as soon as these facts of it are known; any activity of the worker counts as progress.
+    """Return the episode as soon as all its fields named in `facts` are known.
+
+    Any activity of the worker counts as progress.
 
     Raises:
         DemoFailed: If there is no progress, or the episode's publication fails.

@@ -156,8 +156,8 @@ class PlanAdmin(admin.ModelAdmin):
     def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
         """Return the read-only fields.
 
-        Of a frozen plan they are all fields of the design, of the draft of a later version only the name, because all
-        versions share it. Another draft has none.
+        In a frozen plan, all fields of the design are read-only. In the draft of a later version, only the name is,
+        because all versions share it. In any other draft no field is read-only.
         """
         if obj is None:
             return ()

@@ -1,4 +1,4 @@
-"""Allocation of a plan's slots to stations: each is handed out in the plan's order, under a code.
+"""Allocation of a plan's slots (scheduled trials) to stations: handed out in the plan's order, each under a code.
 
 A block is allocated to one station as a whole, so that checkpoints are compared on the same robot at nearly the same
 time. A station finishes its block, including repetitions, before it gets another.

@@ -104,10 +104,11 @@ def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
 
 @transaction.atomic
 def confirm_cameras(*, user: User, station: Station, first: bool = False) -> CameraCheck:
-    """Record that each camera shows the same as its reference, with its current image and match.
+    """Record that the user has confirmed each camera to show the same as its reference picture.
 
-    With `first`, missing references are created from the current images. Raises: Conflict, which names cameras without
-    reference.
+    The record has each camera's current image and its match to the reference. With `first`, missing references are
+    created from the current images.
+    Raises: Conflict, which names the cameras without reference.
     """
     require_role(user, Role.OPERATOR)
     cameras = cameras_of(station)
@@ -271,7 +272,8 @@ def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> CameraMatch:
 def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     """Store the current images before the run, with their match to the position's references.
 
-    Raises: Conflict if a match is below the plan's least one and `override` has no reason.
+    `override` is the reason for which a low match is accepted. Raises: Conflict if a match is below the least match
+    that the plan requires, and `override` is empty.
     """
     require_role(user, Role.OPERATOR)
     reason = clean_text("override", override, LONGEST_NOTE)

@@ -42,10 +42,10 @@ def ended_by(trial: Trial) -> str:
 
 
 def end_of(kept: str | None, status: str, reason: str, recording: str | None) -> str:
-    """Return the cause that ended a run: one of `ENDINGS`, or "".
+    """Return the cause that ended a run: one of `ENDINGS`, or "" for none of these.
 
-    It is the stored value `kept`. For trials that predate this value (`kept` is None), it is derived from status,
-    reason and the status of the recording (None without a recording).
+    That is the stored value `kept`. For trials that predate this value (`kept` is None), the cause is derived from
+    `status` and `reason` of the trial and from the status `recording` of its recording (None without a recording).
     """
     if kept is not None:
         return kept
@@ -64,7 +64,7 @@ def require_scored_first(plan: Plan, before: Trial | None) -> None:
 def fails_by(plan: Plan, trial: Trial) -> bool:
     """Return True if the plan counts the trial as a failure, whatever its score.
 
-    A trial of whose run nothing was recorded is not counted as one, because it could not be scored.
+    A trial is never counted as a failure if nothing of its run was recorded, because it could not be scored.
     """
     counts = getattr(plan, ended_by(trial) or "on_nothing", CountsAs.JUDGED)
     episode = trial.episode

@@ -172,11 +172,15 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """Scored or interrupted attempt of a compared checkpoint, of slot `slot` in block `block`.
+    """Scored or interrupted attempt at a trial of a compared checkpoint.
 
-    `counts`: whether its score counts. `outcome` is the outcome by its newest score, `first` that by its first score;
-    both ignore scores after the result was stored, and are None without a score. `attempt` is above 1 if an earlier
-    attempt did not count.
+    Attributes:
+        slot: Index of the scheduled trial.
+        block: Block of that trial.
+        counts: Whether the attempt's score counts.
+        outcome: Outcome by the attempt's newest score, None without a score.
+        first: Outcome by its first score, None without a score. Both ignore scores after the result was stored.
+        attempt: Number of the attempt; above 1 if an earlier attempt did not count.
     """
 
     block: int
@@ -291,7 +295,7 @@ def blocks_that_count(plan: Plan) -> list[Block]:
 def findings_of(plan: Plan) -> Findings | None:
     """Return the findings of the frozen design from the blocks that count; None without a comparison.
 
-    Those are the blocks of the reveal if there was one, else the current ones.
+    For a revealed plan, the blocks that count are those of the reveal, else the current ones.
     """
     frozen = frozen_design(plan.document) if plan.document else None
     if frozen is None:
@@ -302,8 +306,9 @@ def findings_of(plan: Plan) -> Findings | None:
 def dropped_of(plan: Plan) -> dict[str, int]:
     """Return the checkpoints that a running plan's rule has dropped, and after how many blocks.
 
-    A trial that is being repeated counts with its score until its repetition is scored. If it counted as missing, a
-    drop could be undone, the omitted trials would come next, and the operator would recognise their checkpoint.
+    A trial that is being repeated counts with its score until its repetition is scored. If such a trial counted as
+    missing, a drop could be undone; the omitted trials would then come next, and the operator would recognise their
+    checkpoint.
     """
     frozen = frozen_design(plan.document) if plan.document else None
     if frozen is None or not frozen.drops:
@@ -348,10 +353,11 @@ def crossed_while_waiting(plan: Plan, since: datetime) -> str:
 
 
 def visible_close_reason(plan: Plan, sealed: bool) -> str:
-    """Return why the plan was closed; if it is `sealed` for the reader, only a reason that the server gave.
+    """Return why the plan was closed.
 
-    Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not confused
-    with them.
+    If the plan is `sealed` for the reader, only a reason that the server gave is returned, and "" in place of an
+    owner's. Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not
+    taken for one of them.
     """
     if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
         own = any(plan.closed_because.startswith(f"{text}, after ") for text in ENDED.values())
@@ -369,9 +375,10 @@ def register_reveal_data(told: Callable[[Plan], dict[str, Any]]) -> None:
 
 
 def reveal_record(plan: Plan) -> dict[str, Any] | None:
-    """Return the data stored at a reveal with its digest: counting blocks, sums per checkpoint, registered data.
+    """Return the data stored at a reveal, with their digest: blocks that count, sums per checkpoint, registered data.
 
-    Later corrections do not change the plan's headline. None for a plan without a comparison before format 7.
+    Because the data are stored, later corrections do not change the plan's headline. None for a plan without a
+    comparison before format 7.
     """
     document = plan.document or {}
     if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:

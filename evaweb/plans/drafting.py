@@ -36,10 +36,11 @@ class Changed:
 
 
 def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
-    """Return the values of the draft that its pages edit, without hidden checkpoints.
+    """Return the values of the draft that its pages edit, by field, without hidden checkpoints.
 
-    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint that is compared with it.
-    If the plan has only these two checkpoints, `challenger` is None, because it follows from `control`.
+    Checkpoints are given by their ids, as text; HIDDEN replaces the id of a hidden one. The value "control" is the
+    checkpoint with which others are compared, the value "challenger" the checkpoint that is compared with the control.
+    If the plan has only these two checkpoints, "challenger" is "", because it follows from the control.
     """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     control, challenger = _roles(plan)
@@ -93,8 +94,8 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
 def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None:
     """Set the comparison's first and second checkpoint from the control and the challenger in `values`.
 
-    `roles` are control and challenger before the change. They are kept if `values` has HIDDEN in their place, because
-    the user may not know them.
+    `roles` are control and challenger before the change. A role for which `values` has HIDDEN keeps its checkpoint,
+    because the user may not know which one it is.
     """
     control, challenger = roles
     control = control if values["control"] == HIDDEN else _number(values["control"])

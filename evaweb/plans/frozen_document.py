@@ -52,7 +52,7 @@ _DRAWN_BY_ITSELF = 6  # format from which the order within each block is drawn i
 
 
 def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
-    """Return the frozen form of a draft as plain JSON; `key` draws the schedule.
+    """Return the frozen form of a draft as plain JSON; the schedule is drawn from the secret `key`.
 
     Raises: UnevenError if the drawn random order does not fit the design; EvaError if the design is invalid.
     """
@@ -148,8 +148,8 @@ def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
 def require_checkpoints(plan: Plan) -> None:
     """Raise Conflict if any of the plan's checkpoints differs from its frozen form or is deactivated.
 
-    All are checked, whichever the trial uses, and the message does not name it: otherwise deactivating one would reveal
-    which checkpoint comes next.
+    All checkpoints are checked, whichever the trial uses, and the message names none of them: otherwise deactivating a
+    checkpoint would reveal whether it comes next.
     """
     by_name = {row.name: row for row in plan.checkpoints.all()}
     for row in (plan.document or {})["checkpoints"]:

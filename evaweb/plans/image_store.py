@@ -1,6 +1,7 @@
 """Current images of a station's cameras, the match of two images, and stored pictures.
 
-A picture is stored in DATA/pictures under the SHA-256 of its bytes: it never changes, and equal ones are stored once.
+A picture is stored in DATA/pictures under the SHA-256 of its bytes. A stored picture never changes, and equal pictures
+are stored once.
 """
 
 from __future__ import annotations

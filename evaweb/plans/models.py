@@ -377,8 +377,9 @@ class PlanEvent(models.Model):
 class Reference(models.Model):
     """Reference picture of a camera: it shows a position as laid out or, without a position, the camera's view.
 
-    The newest per camera and position counts. `picture` names a file: see evaweb.plans.image_store. `regions` are
-    around objects: see evaweb.plans.region_matching; changed regions are a new row with the same picture.
+    The newest reference per camera and position counts. `picture` names a file: see evaweb.plans.image_store. `regions`
+    are rectangles around objects: see evaweb.plans.region_matching. Changed regions are stored as a new row with the
+    same picture.
     """
 
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="references")

@@ -1,9 +1,9 @@
 """Regions of a reference picture around objects, and the match of a live picture in each.
 
-A region's match is a normalised cross-correlation of the three colours at the camera's own resolution, but at most 640
-pixels wide: the best within TOLERANCE of the drawn place. Both pictures are band-passed first to details of 5 to 33
-pixels, which removes sensor noise and slowly varying light. Brightness has no influence, nor has contrast between half
-and double; beyond that the match decreases, so that a faint trace of an object does not match.
+A region's match is the largest normalised cross-correlation of the three colours within TOLERANCE of the drawn place.
+It is computed at the camera's own resolution, but at most 640 pixels wide. Both pictures are band-passed first to
+details of 5 to 33 pixels, which removes sensor noise and slowly varying light. Brightness has no influence, nor has
+contrast between half and double; beyond that the match decreases, so that a faint trace of an object does not match.
 """
 
 from __future__ import annotations
@@ -103,11 +103,12 @@ def check_sizes(found: list[Region], jpeg: bytes) -> None:
 
 
 def match_regions(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
-    """Return for each region {"name", "at", "match", "dx", "dy", "words"}.
+    """Return for each region a dict with the keys "name", "at", "match", "dx", "dy" and "words".
 
-    `at` is the region, [x, y, width, height] as fractions; `match` ranges from 1 (identical) to 0; `dx` (to the right)
-    and `dy` (down) are the displacement of the object in pixels of the live picture, None if it is not recognised;
-    `words` is the same as text. Raises: EvaError if the live picture is so small that a region has no pixel.
+    "at" is the region, [x, y, width, height] as fractions of the picture. "match" ranges from 1 (identical) to 0. "dx"
+    (to the right) and "dy" (down) are the displacement of the object in pixels of the live picture `now`, None if the
+    object is not recognised. "words" is the same as text. Raises: EvaError if the live picture is so small that a
+    region has no pixel.
     """
     live = decoded(now, "RGB")
     before, after = _to_common_size([decoded(reference, "RGB"), live])

@@ -49,10 +49,10 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
 
 
 def overlapping_plans(plan: Plan) -> QuerySet[Plan]:
-    """Return frozen plans with another name that share at least two checkpoints: their results reveal the same.
+    """Return frozen plans with another name that share at least two checkpoints with `plan`.
 
-    A copy of a checkpoint counts as the same checkpoint: equal weights (or, without digest, the same server) and
-    strategy.
+    The results of such a plan reveal the same as those of `plan`. A copy of a checkpoint counts as the same checkpoint:
+    equal weights (or, without digest, the same server) and strategy.
     """
     rows = Checkpoint.objects.values_list("pk", "digest", "policy", "strategy")
     label_of = {

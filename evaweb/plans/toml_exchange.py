@@ -185,7 +185,7 @@ def _without_none(value: Any) -> Any:
 def import_file(*, user: User, text: str, pictures: Mapping[str, bytes] | None = None) -> list[str]:
     """Import a file and return a message per object. Raises: EvaError or Conflict; nothing is imported then.
 
-    `pictures`: content of an archive, by the names that references use.
+    `pictures` are the contents of the picture files of an archive, by the names that references use.
     """
     require_role(user, Role.ADMIN)
     tables = _read(text)

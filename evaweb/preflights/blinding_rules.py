@@ -1,7 +1,7 @@
 """Visible parts of a preflight, for pages and REST.
 
-Addresses, times, sizes and names reveal a server's checkpoint. They are shown to operators and administrators, except
-users from whom a blind plan hides the checkpoint.
+Addresses, times, sizes and names in a preflight reveal a server's checkpoint. Only operators and administrators see
+them, and of these not the users from whom a blind plan hides the checkpoint.
 """
 
 from __future__ import annotations

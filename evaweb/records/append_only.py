@@ -84,7 +84,8 @@ class TriggerSpec:
         return {event: f"{self.table}_{name}" for event, name in names.items()}
 
     def refused(self, different: str) -> Mapping[str, str]:
-        """Return by SQL event (UPDATE, DELETE, INSERT) the condition about OLD and NEW under which it is refused.
+        """Return by SQL event (UPDATE, DELETE, INSERT) the condition about OLD and NEW under which such a statement is
+        refused.
 
         Args:
             different: The NULL-safe inequality operator of the database.

@@ -61,9 +61,10 @@ def _reviews(episode: Episode, lines: Sequence[ReviewLine]) -> int:
 
 
 def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
-    """Update the rows from the lines; each segment becomes as in its newest line.
+    """Update the rows of segments from the lines: each row becomes as in the segment's newest line.
 
-    If lines were skipped (not `whole`), rows are only added, because the missing lines may have changed other rows.
+    Returns the number of changed rows. Rows of segments without a line are deleted. If lines were skipped (not
+    `whole`), rows are only added, because the missing lines may have changed other rows.
     """
     by_uuid = {line.uuid: line for line in segments_of(lines)}
     changed = 0

@@ -66,9 +66,10 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Return the response, or the error response with a message that replaces it.
+        """Return the response, or an error response with a message that replaces it.
 
-        Replaced is an error response without JSON, if it answers a REST request or has status 405 (method not allowed).
+        An error response that is not JSON is replaced if the request was to REST or the status is 405 (method not
+        allowed).
         """
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")

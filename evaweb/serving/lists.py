@@ -61,8 +61,8 @@ class Column:
 class Filter:
     """Filter of a list: one of `choices` (pairs of value and label), or a typed text.
 
-    `any` labels the absence of a choice. If not `strict`, the page itself reports unknown values. A filter of kind
-    UNSEEN has no input field: links set it.
+    `any` is the label for not filtering. If not `strict`, values that are not among the choices are reported by the
+    page itself. A filter of kind UNSEEN has no input field and is set by links.
     """
 
     name: str

@@ -16,9 +16,10 @@ _PORT = re.compile(r":([0-9]{1,5})$")
 def is_own_origin(origin: str, host: str, scheme: str, web_port: int | None = None) -> bool:
     """Return True if pages of `origin` belong to the lab, for a request with Host `host` over `scheme`.
 
-    That is so for the same scheme and host, and for CSRF_TRUSTED_ORIGINS (without wildcards). A server that runs next
-    to the web passes the web's port as `web_port`: pages at that port of the same host, over plain HTTP, belong to the
-    lab too. Behind a proxy this is not needed, because web and server have the same origin there.
+    Pages belong to the lab if their origin has the same scheme and host as the request, or is in CSRF_TRUSTED_ORIGINS
+    (without wildcards). A server that runs next to the web passes the web's port as `web_port`: pages at that port of
+    the same host, over plain HTTP, belong to the lab too. Behind a proxy `web_port` is not needed, because web and
+    server have the same origin there.
     """
     try:
         parsed = urlsplit(origin)

@@ -117,7 +117,8 @@ def _login_of(scope: dict[str, Any]) -> bytes:
 class _Client:
     """Receiver and sender of one request. A hang-up is reported only when the application sends.
 
-    If Django learned of it at once, it would abandon its thread, which keeps running outside the limit.
+    If Django learned of a hang-up at once, it would abandon the thread of the request, which would keep running outside
+    the limit.
     """
 
     def __init__(self, receive: Any, send: Any) -> None:

@@ -173,9 +173,9 @@ def record_estop(
     at: datetime,
     unverified: str = "",
 ) -> Command:
-    """Queue the row of an e-stop that was pressed at `at`; it is written when the database accepts it.
+    """Queue the row of an e-stop that was pressed at `at`; the row is written when the database accepts it.
 
-    `station` and `user` need only their names. `unverified`: why the user is unknown.
+    `station` and `user` need only their names. `unverified` is the reason why the user is unknown.
     """
     args = {"why": clean_reason(why)} | ({"unverified": unverified} if unverified else {})
     row = Command(
@@ -305,9 +305,10 @@ def _queue_record(row: Command, answer: Answer) -> Command:
 
 
 def _stored_row(row: Command) -> Command:
-    """Store the row, or merge its better knowledge into the first row with that uuid; return the stored row.
+    """Store the row, or complete the first row with the same uuid by it; return the stored row.
 
-    An e-stop press whose uuid belongs to another command gets its own row.
+    The first row gets an answer or a user that it lacks. An e-stop press whose uuid belongs to another command gets its
+    own row.
     """
     _resolve(row)
     try:
@@ -333,8 +334,8 @@ def _merged(row: Command) -> Command:
 def _merged_fields(row: Command, first: Command) -> list[str]:
     """Return the names of fields that `row`, a record of a stop, can add to `first`, which arrived on another path.
 
-    They are those of the answer, if `first` has none, or none by which the stop was carried out, and those of the user,
-    if `first` has no user.
+    The fields of the answer are among them if `first` has no answer, if only `row` has an answer by which the stop was
+    carried out, or if only `row` has latched the stop anew. User and args are among them if only `row` has a user.
     """
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"
@@ -344,9 +345,10 @@ def _merged_fields(row: Command, first: Command) -> list[str]:
 
 
 def _first_or_own(row: Command) -> Command | None:
-    """Return the existing row of this command; give a different press with the same uuid a uuid of its own.
+    """Return the row that this command already has, None if there is none.
 
-    The new uuid is derived from the press, so that every writer and every repetition finds the same row.
+    If the uuid belongs to another press of the e-stop or another command, an e-stop `row` gets a uuid of its own first.
+    That uuid is derived from the press, so that every writer and every repetition finds the same row.
     """
     try:
         first = _find_first(row)

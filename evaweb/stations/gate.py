@@ -41,9 +41,10 @@ class GateError(EvaError):
 
 
 class Keys:
-    """Admitted keys, read from the database twice a second; while it does not answer, the last result counts.
+    """Keys of stations that may connect to the gate, read from the database twice a second.
 
-    The result is also stored in a file: linked stations can be stopped even if the gate starts without the database.
+    While the database does not answer, the last result counts. The result is also stored in a file: linked stations can
+    be stopped even if the gate starts without the database.
     """
 
     def __init__(self, data: Path) -> None:

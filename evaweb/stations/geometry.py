@@ -24,7 +24,7 @@ Float64 = NDArray[np.float64]
 def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, simulated: bool) -> dict[str, Any]:
     """Return parts, shapes, frames and surroundings of a robot with these groups.
 
-    Matrices are column-major. A frame's `part` is None if it is fixed in the scene.
+    Matrices are column-major. In a frame, key "part" is None if the frame is fixed in the scene.
     Raises: NotFound for an unknown robot or group.
     """
     drawn = drawn_robot(robot, groups)

@@ -177,10 +177,10 @@ def take_over(*, user: Any, station: Station, page: str, reason: str) -> Lease:
 
 
 def record_snapshot_lease(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
-    """Record the lease in a snapshot of the runtime (its "lease"); return True if rows changed.
+    """Record the lease that a snapshot of the runtime reports; return True if rows changed.
 
-    This ends expired leases in the records and adds those acquired by a terminal or script. A snapshot older than the
-    newest row of the same boot is ignored.
+    `held` is the value of the snapshot's key "lease". Expired leases are ended in the records, and leases acquired by a
+    terminal or script are added. A snapshot older than the newest row of the same boot is ignored.
     """
     holder, epoch = str(held["holder"]), int(held["epoch"])
     with transaction.atomic():

@@ -137,8 +137,8 @@ def redact_events(
 ) -> list[dict[str, Any]]:
     """Return the events that reveal no policy.
 
-    They are renumbered by their times [us], increasing from `last`, so that neither the number nor the times of hidden
-    events can be inferred from gaps.
+    The events get new numbers, which are their times [us], increasing from `last`, so that neither the number nor the
+    times of hidden events can be inferred from gaps.
     """
     events = []
     for row in rows:

@@ -37,7 +37,7 @@ class _PendingRequest(Generic[T]):
 
 
 class RequestCoalescer(Generic[T]):
-    """Pending requests to stations, in which requests with equal station and key share an answer.
+    """Pending requests to stations, in which requests with equal station and key can share an answer.
 
     It is thread-safe, and callers do not block. At most `most` different keys may be pending per station; None for no
     limit.
@@ -60,11 +60,12 @@ class RequestCoalescer(Generic[T]):
         identity: Hashable,
         shared: bool = False,
     ) -> Future[T]:
-        """Start `work` or join a pending request with the same `key`; return the future of the answer.
+        """Start `work`, or join a pending request to the station with the same `key`; return the future of the answer.
 
-        A call with the same `identity` as the pending request shares its answer. A call with another identity causes
-        one further request, sent after this call, and gets its answer; with `shared` it gets the pending request's
-        answer, and the further request is sent regardless.
+        If a request with this key is pending, `identity` decides. If it equals that of the pending request, this call
+        shares the pending request's answer. Otherwise one further request is sent when the pending one is over; all
+        calls that have arrived by then share that further request, and this call gets its answer. With `shared`, this
+        call gets the pending request's answer instead, and the further request is sent nevertheless.
         Raises: TooManyRequests.
         """
         place, flight = (station, key), _PendingRequest(identity, work)

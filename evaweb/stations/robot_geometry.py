@@ -131,7 +131,8 @@ def groups_of(joint_names: Iterable[str]) -> tuple[str, ...]:
 
 
 def describe_robot(robot: str) -> dict[str, Any]:
-    """Return the facts of a robot; if its description is unreadable, they are empty, and `error` is the reason.
+    """Return the facts of a robot; if its description is unreadable, the facts are empty, and key "error" has the
+    reason.
 
     The page must open nevertheless, because it has the stop buttons.
     """

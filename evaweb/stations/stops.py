@@ -1,7 +1,7 @@
 """Stop, halt and e-stop: sent directly to the station, without the database.
 
-`press_estop` and `request_stop` never block: requests run in threads per station, and a call during an equal request
-shares its answer.
+`press_estop` and `request_stop` never block: requests run in threads per station. While an equal request to the station
+is pending, a new one does not get a thread of its own, see `request_coalescer`.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> F
 def request_stop(command: messages.Command, station: str) -> Future[Answer]:
     """Send a stop or halt and return the future of the answer.
 
-    While an equal request of the same lease is pending, calls with another uuid do not share its answer: they are
-    combined into one more request, which is sent afterwards.
+    While a request of the same kind and lease is pending at the station, calls with another uuid do not share its
+    answer: they are combined into one more request, which is sent afterwards.
     """
     key = (command.kind, command.holder, command.epoch)
     try:

@@ -1,7 +1,7 @@
 """Surroundings of a robot in the scene: table, floor, mounts, and the direction from robot to table.
 
 The scene is that of the simulated bench: z = 0 is the surface of the table, objects lie within BENCH's `area`. A robot
-whose body reaches below the table stands on a floor, and the table is cut clear of it.
+whose body reaches below the table stands on a floor, and the table is cut so that it does not touch the body.
 """
 
 from __future__ import annotations

@@ -411,9 +411,10 @@ def _within(
 ) -> tuple[int, NDArray[np.float64]]:
     """Return how many tables may stop, and the error at each rate if they do; for a design that tests equal rates.
 
-    The last of them is at one of the indices in `ends`. `numbers` are the total successes of the tables, `even` their
-    probabilities at rates of 0.5. The error grows with the number of tables at every rate, so the number is found by
-    bisection.
+    The tables are ordered from the most extreme downwards; the number of tables must end at one of the indices in
+    `ends`. `numbers` are the total successes of the tables, `even` their probabilities at rates of 0.5, `spent` is the
+    error at each rate so far, and `most` the largest error allowed. The error grows with the number of tables at every
+    rate, so the number is found by bisection.
     """
     import numpy as np
 

@@ -1,9 +1,9 @@
 """Confidence sequence of the difference of two arms: an interval that is valid after every pair.
 
-A mean difference m is excluded once a bet against it has reached 2/alpha, either that the mean is above m or that it
-is below. The bets are those of `sequential.score_evidence`, which tests m = 0. By Ville's inequality the true mean is
-ever excluded with probability at most alpha, for any distribution of differences. Source: Waudby-Smith and Ramdas
-(2023), section 4, with stakes fixed beforehand.
+Two bets are placed against each mean difference m: that the mean is above m, and that it is below m. As soon as one of
+them has reached 2/alpha, m is excluded. The bets are those of `sequential.score_evidence`, which tests m = 0. By
+Ville's inequality the true mean is ever excluded with probability at most alpha, for any distribution of differences.
+Source: Waudby-Smith and Ramdas (2023), section 4, with stakes fixed beforehand.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def design_power(
 ) -> DesignPower:
     """Return power and number of pairs of a design of at most `pairs` pairs.
 
-    They are exact, except for "evidence" (4,000 simulations). With a `margin` the power is that of a non-inferiority
+    Both are exact, except for "evidence" (4,000 simulations). With a `margin` the power is that of a non-inferiority
     test: the probability of finding that the first arm's rate is above the second's minus the margin. `looks` are the
     numbers of pairs after which there is a look; if empty, there is one after every pair.
     """
@@ -94,10 +94,12 @@ def pairs_needed(
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Comparison of all designs; each tuple is in the order of RULES.
+    """Comparison of all designs.
 
-    `needs`: design that reaches the wanted power; `chances`: power and number of pairs with the given pairs; `powers`:
-    one tuple of powers per gain.
+    Attributes:
+        needs: For each rule in RULES, the design that reaches the wanted power; None if there is no such design.
+        chances: For each rule in RULES, the power and number of pairs of the design with the given number of pairs.
+        powers: For each gain in the success rate, the powers of the designs in the order of RULES.
     """
 
     needs: tuple[DesignPower | None, ...]

@@ -430,7 +430,7 @@ def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tupl
     """Return one comparison of a paired design as a design of its own at its share of alpha, and the blocks with both
     arms.
 
-    Used to check conclusions of a design that dropped arms: its later blocks lack some of them.
+    This is used to check conclusions of a design that dropped arms: the later blocks of such a design lack some arms.
     """
     both = [block for block in blocks if {*pair} <= {arm for arm, _ in block}]
     return replace(found, alpha=found.share, comparisons=(pair,), drops=False), both

@@ -64,8 +64,8 @@ def newcombe(x1: int, n1: int, x2: int, n2: int, level: float = LEVEL) -> Differ
 def barnard(x1: int, n1: int, x2: int, n2: int) -> ExactTest:
     """Return Barnard's exact test of x1/n1 against x2/n2, two-sided and pooled.
 
-    Valid for a number of trials fixed beforehand. Repeated testing finds differences that do not exist; use
-    `sequential` for that. If all or none succeeded in both arms, the statistic is 0 and p is 1.
+    The test is valid for a number of trials fixed beforehand. Repeated testing finds differences that do not exist: for
+    that use the module `sequential`. If all or none succeeded in both arms, the statistic is 0 and p is 1.
     """
     check_counts(x1, n1)
     check_counts(x2, n2)

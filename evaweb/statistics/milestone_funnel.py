@@ -20,7 +20,8 @@ class FunnelStep:
 def funnel(reached: Sequence[Sequence[bool]]) -> list[FunnelStep]:
     """Return the funnel step of each milestone; `reached` [trials, milestones] is whether a trial reached it.
 
-    `of_previous` counts trials that reached the previous milestone, whether or not the milestones are ordered.
+    In each step, `of_all` is the share of trials that reached the milestone, and `of_previous` is the same share among
+    the trials that reached the previous milestone, whether or not the milestones are ordered.
     """
     if not reached:
         return []

@@ -53,10 +53,10 @@ def over_conditions(
 ) -> Difference:
     """Return the difference of mean outcomes (0 to 1) over initial conditions, which are regarded as a random sample.
 
-    Only conditions with trials of both arms count, each with equal weight.
+    Only conditions that are keys of both `first` and `second` count, each with equal weight.
 
     Raises:
-        StatisticsError: If fewer than two conditions are shared, or one of them has no trial of an arm.
+        StatisticsError: If there are fewer than two such conditions, or one of them has an empty list of outcomes.
     """
     shared = sorted(set(first) & set(second), key=str)
     if len(shared) < 2:

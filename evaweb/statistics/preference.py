@@ -2,7 +2,7 @@
 
 Model: Bradley and Terry (1952), ties by Davidson (1970), order by Davidson and Beaver (1977). With log-worths t, the
 outcomes of a comparison of i (shown first) and j have the log-weights t_i + g/2, t_j - g/2 and log 2 + f + (t_i +
-t_j)/2. It is a multinomial logit, fitted by Newton's method; if no finite estimate exists, nothing is ranked.
+t_j)/2. The model is a multinomial logit, fitted by Newton's method; if no finite estimate exists, nothing is ranked.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _ROUNDED = 1e-13  # relative rounding error of a likelihood
 class NotIdentifiedError(StatisticsError):
     """Error if the comparisons determine no common ranking.
 
-    `components` are sets of policies that can be ranked among themselves. They are ordered such that no policy was ever
-    preferred to one of an earlier set, if such an order exists.
+    `components` are sets of policies that can be ranked among themselves. If possible, the sets are ordered such that
+    no policy was ever preferred to a policy of an earlier set.
     """
 
     def __init__(self, text: str, components: Sequence[Sequence[str]]) -> None:
@@ -64,11 +64,16 @@ class Contrast:
 
 @dataclass(frozen=True, slots=True)
 class Preferences:
-    """Fitted preferences.
+    """Preferences as fitted by the model.
 
-    `worth` and `error` are centred log-worths and their standard errors by policy; `contrasts` are by pair
-    (alphabetical). `tie` is nu (None without ties): equal policies tie with probability nu / (1 + nu). `order` is the
-    log odds that being first adds, `order_z` its z; both None if not fitted.
+    Attributes:
+        worth: Centred log-worth of each policy.
+        error: Standard error of each log-worth.
+        contrasts: Contrast of each pair of policies, whose names are in alphabetical order.
+        tie: Parameter nu: equal policies tie with probability nu / (1 + nu). None without ties.
+        order: Log odds that being shown first adds; None if not fitted.
+        order_z: z value of `order`; None if not fitted.
+        log_likelihood: Log likelihood of the fit.
     """
 
     worth: Mapping[str, float]

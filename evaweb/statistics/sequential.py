@@ -1,9 +1,9 @@
 """Anytime-valid evidence: it may be examined, and the evaluation stopped, after every pair of trials.
 
-An e-process is a bet against "both arms are equal" with an expected wealth of at most 1 while that is true. By Ville's
-inequality it reaches 1/alpha with probability at most alpha, however often it is examined. Both directions are tested,
-each at alpha/2. Sources: Turner and Gruenwald (2023), safe two-sample tests, for success and failure; Waudby-Smith and
-Ramdas (2023), betting, for partial credit.
+An e-process is the wealth of a bet against "both arms are equal"; the expected wealth is at most 1 while this is true.
+By Ville's inequality the wealth reaches 1/alpha with probability at most alpha, however often it is examined. Both
+directions are tested, each at alpha/2. Sources: Turner and Gruenwald (2023), safe two-sample tests, for success and
+failure; Waudby-Smith and Ramdas (2023), betting, for partial credit.
 """
 
 from __future__ import annotations

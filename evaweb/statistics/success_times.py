@@ -22,7 +22,7 @@ Times = Sequence[float | None]  # time to success of each trial [s]; None: it fa
 class Curve:
     """Share of successes by time: from `times[i]` [s] on it is `share[i]`, with its pointwise Wilson interval.
 
-    It is 0 before the first time. The last time is at most `until` [s], the horizon of all `n` trials.
+    The share is 0 before the first time. The last time is at most `until` [s], the horizon of all `n` trials.
     """
 
     times: tuple[float, ...]

@@ -38,13 +38,14 @@ def trial_failure(
     score: UUID | str | None = None,
     reason: str = "",
 ) -> Score:
-    """Correct why a trial failed, without changing its score otherwise; None leaves a level unchanged.
+    """Correct why a trial failed, without changing its score otherwise.
 
-    Success, points and milestones are copied from the current score, not evaluated with the scene as it is now. Without
-    a `reason`, the old and new terms are recorded as the reason. An identical request adds nothing.
+    `failure` is the cause and `failure_phase` the phase; None leaves the present one unchanged. Success, points and
+    milestones are copied from the current score, not evaluated with the scene as it is now. Without a `reason`, the old
+    and new terms are recorded as the reason. An identical request adds nothing.
 
-    Raises: Conflict if the trial has no score that counts, or if `score`, the uuid of the score that the user saw, is
-    not that score.
+    Raises: Conflict if the trial has no score that counts, or if the score that counts is not the one with the uuid
+    `score`, which the user saw.
     """
     require_role(user, Role.OPERATOR)
     with transaction.atomic():

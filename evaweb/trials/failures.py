@@ -55,8 +55,8 @@ class Level:
 def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
     """Return the active phases, then the active causes, as a form offers them.
 
-    `said` maps each field to the selected term, which is included even if it is retired or deleted. A level without
-    terms is omitted.
+    `said` maps each field to the selected term, which is included even if it is retired or deleted. If there are no
+    phases, or no causes, they are omitted.
     """
     terms, levels = list(FailureTerm.objects.filter(active=True)), []
     for field, level in FIELDS.items():

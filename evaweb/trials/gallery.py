@@ -87,7 +87,8 @@ class Group:
 def failed_list(filters: FailureFilters, sight: Visibility) -> QuerySet[Trial]:
     """Return the failed trials that count, sorted by group, newest first. Raises: EvaError for invalid filters.
 
-    Trials of hidden checkpoints are included without distinguishing them: they are sorted by trial number.
+    If trials are grouped by checkpoint, those of hidden checkpoints form one group at the end, sorted by trial number,
+    so that their checkpoints cannot be distinguished.
     """
     if filters.group not in GROUPS:
         raise EvaError(_GROUP_ALLOWED(group=filters.group, groups=", ".join(GROUPS)))

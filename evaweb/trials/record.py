@@ -1,7 +1,7 @@
 """Records of trials: columns with their storage, display and visibility; journal lines of their scores and voids.
 
 `TrialRecord` declares every column once. Manifests, scores files, restoring, REST, CSV, Parquet and result tables are
-derived from it; a column is a field of models.Trial and one here (docs/contributing.md).
+derived from it. To add a column, add a field to models.Trial and one to `TrialRecord` (docs/contributing.md).
 """
 
 from __future__ import annotations

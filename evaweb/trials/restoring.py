@@ -1,7 +1,8 @@
 """Restoring of lost trials and scores from manifests and scores files.
 
-Existing rows are not overwritten; a row older than the disk (from a backup) is updated from it. Scenes, positions,
-checkpoints and users that are missing too are created by name, deactivated, and marked as placeholders.
+Existing rows are not overwritten, except that a row that is older than the files (from a backup) is updated from them.
+Scenes, positions, checkpoints and users that are missing too are created by name, deactivated, and marked as
+placeholders.
 """
 
 from __future__ import annotations
@@ -236,9 +237,10 @@ def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
 
 
 def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
-    """Return the score that counts: normally that of the last line.
+    """Return the score that counts: normally that of the last of `lines`.
 
-    A trial has two files if its episode was found late. If a later score is in the other file, that one counts.
+    `lines` are those of one scores file. If the trial's current score was restored from another file (a trial has two
+    if its episode was found late) and is newer, that score counts.
     """
     newest, current = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
     elsewhere = current is not None and current.uuid not in [line.uuid for line in lines]

@@ -294,9 +294,9 @@ _known: FingerprintCache[_Known] = FingerprintCache()
 def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
     """Return the summaries of the scored trials among `trials`, by scene and checkpoint.
 
-    `trials` may be filtered by columns of trials only, because changes are found by them: every change to data in a
-    summary also saves its trial or marks it as changed. The cache key is the query with the ids of named rows, because
-    a name may come to denote another row.
+    `trials` may be filtered by columns of trials only, because cached summaries are updated from changed rows of
+    trials: every change to data in a summary also saves its trial or marks the trial as changed. The cache key is the
+    query with the ids of named rows, because a name may come to denote another row.
     """
     return _known.renew(str(trials.query), lambda before: _brought_up(before, trials)).cells
 

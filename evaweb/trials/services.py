@@ -183,10 +183,11 @@ def prepare_trial(
     checkpoint: Checkpoint,
     seed: int | None = None,
 ) -> Trial:
-    """Prepare the next trial of this checkpoint at this position, in the station's open bench.
+    """Prepare the next trial of this checkpoint at this position, outside any plan.
 
-    Trials are numbered, and each number may have several attempts. The trial is a new attempt of the lowest number
-    whose newest attempt does not count; if there is no such number, it is the first attempt of the next number.
+    The trial belongs to the station's open bench, the evaluation of trials without a plan. Trials are numbered, and
+    each number may have several attempts. The trial is a new attempt of the lowest number whose newest attempt does not
+    count; if there is no such number, it is the first attempt of the next number.
     Raises: Conflict, with advice, if the station has an unfinished trial.
     """
     require_role(user, Role.OPERATOR)

@@ -79,9 +79,11 @@ def trial_command(
     uuid: UUID | str | None = None,
     args: Mapping[str, Any] | None = None,
 ) -> Command:
-    """Send a command for a trial; `setup` and `run` get their arguments from the trial, other commands from `args`.
+    """Send a command for a trial.
 
-    Never call it within a transaction. After an accepted run the trial is running and its episode has a row.
+    The commands "setup" and "run" get their arguments from the trial, other commands from `args`. After an accepted run
+    the trial is running, and the database has a row for its episode. Never call this within a transaction.
+
     Raises: Conflict if the trial is not prepared, or the station was last set up for something else.
     """
     require_role(user, Role.OPERATOR)
@@ -237,9 +239,9 @@ def _require_set_up(trial: Trial) -> None:
 
 
 def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
-    """Raise Conflict unless the station has this checkpoint loaded, whichever client set it up last.
+    """Raise Conflict unless the station has the trial's checkpoint loaded, whichever client set it up last.
 
-    A change after this check makes the run stale, and the station refuses it.
+    If the set-up changes after this check, the run is stale, and the station refuses to run it.
     Returns: Durations of the policy's set-up stages [s], None if unknown.
     """
     status = connection_to(trial.station.name).status()

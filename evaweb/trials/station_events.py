@@ -53,9 +53,10 @@ def apply_station_event(
 
 
 def begin_run(trial: Trial, *, command: Command, episode: UUID | None) -> None:
-    """Start the trial's run, which the station has accepted: on the answer or, if that was lost, on the event.
+    """Start the trial's run, which the station has accepted.
 
-    The caller holds a lock on the trial's row. Idempotent; ignores a run whose recording could not be opened.
+    This is called when the station answers and, if that answer was lost, when the station's event arrives. The caller
+    holds a lock on the trial's row. Idempotent; a run whose recording could not be opened is ignored.
     """
     if Command.objects.filter(pk=command.pk).exclude(unopened="").exists():
         return

@@ -146,8 +146,8 @@ def _problems(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
 def _matching_keys(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
     """Return how well `value` fits the kind of table that `config` models, as a pair for sorting.
 
-    It has the number of keys of `value` that resemble a key of that kind and, to break ties, the number of that kind's
-    keys.
+    The first number is that of keys of `value` that resemble a key of that kind; the second, which breaks ties, is the
+    number of the kind's keys.
     """
     near = [key for key in value if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)

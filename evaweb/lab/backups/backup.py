@@ -86,7 +86,7 @@ def make(folder: Path, *, keep: int | None, tell: Tell) -> Backup:
         tell: Called with a text for each part.
 
     Raises:
-        BackupError: If it fails; nothing of it is left.
+        BackupError: If the backup fails; then none of its files are left.
     """
     folder = folder.expanduser().absolute()
     data = Path(settings.DATA_DIR).absolute()
@@ -207,8 +207,8 @@ def restore(path: Path, tell: Tell) -> Backup:
     into the data folder when all are complete.
 
     Raises:
-        BackupError: If it fails. After a failure that comes later than the start of the database's restore, the folder
-            RESTORING remains, and no lab starts while it exists.
+        BackupError: If it fails. If the restore of the database has begun by then, the folder RESTORING remains, and no
+            lab starts while that folder exists.
     """
     backup, backend = Backup.at(path.expanduser().absolute()), databases.database()
     about = backup.about["database"]

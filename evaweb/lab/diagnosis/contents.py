@@ -160,9 +160,10 @@ def logs() -> list[Path]:
 
 
 def programs(sight: Visibility) -> list[dict[str, Any]]:
-    """Return whether the lab runs and, for each program with a log, the time since its last line [s].
+    """Return whether the lab runs and, for each program with a log, the time since the log's last line [s].
 
-    The policy that was used last reveals the checkpoint: blind readers get only the lab.
+    If anything is hidden from the reader, the programs are omitted: the policy whose log has the newest line would
+    reveal the checkpoint.
     """
     now = time.time()
     rows: list[dict[str, Any]] = [{"program": "lab", "runs": deployments.lab_runs()}]

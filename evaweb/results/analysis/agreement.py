@@ -172,8 +172,8 @@ def preference_comparisons(plan: Plan) -> list[Comparison]:
 def preference_ranking(plan: Plan) -> dict[str, Any] | None:
     """Return the Bradley-Terry-Davidson ranking of the plan's preferences, None without any.
 
-    If no finite, unique ranking exists, `ranking` is null, `reason` explains it, and each of `groups` can be ranked on
-    its own.
+    Key `ranking` of the result is null if no finite, unique ranking exists. Then key `reason` explains why, and each
+    entry of `groups` can be ranked on its own.
     """
     comparisons = preference_comparisons(plan)
     if not comparisons:

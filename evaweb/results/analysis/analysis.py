@@ -97,8 +97,8 @@ def analyse(
 ) -> Analysis:
     """Return the complete analysis of these outcomes.
 
-    Only the design decides planned comparisons: checkpoints that it separated share no letter. While it is undecided
-    there are neither letters nor anything else that could pass for a decision.
+    Only the design decides planned comparisons: checkpoints that it separated share no letter. While a
+    comparison is undecided, it has neither letters nor anything else that could pass for a decision.
 
     Args:
         outcomes: Trials that count.

@@ -46,7 +46,7 @@ class Funnel:
 class FailureMode:
     """Phase and cause of failure ("" if unspecified) of `count` out of `n` trials.
 
-    `interval` is the exact interval of the share `count` / `n`. It is valid for a single mode that was named
+    `interval` is the exact interval of the share `count` / `n`. The interval is valid for a single mode that was named
     beforehand; for the most frequent of many modes it is too optimistic.
     """
 

@@ -86,10 +86,11 @@ class AttemptRecord:
 
 
 def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[BenchImage]) -> dict[str, Any]:
-    """Return the conduct of a plan as a dict, with one entry for each subject of this module.
+    """Return the conduct of a plan as a dict.
 
-    `runs` are all attempts, `looks` all camera checks of the bench before them. One more query is made for each earlier
-    version of the plan.
+    Its keys are the subjects of this module, such as `looks`, `corrections` and `deviations`; its values are the
+    results of the functions below. `runs` are all attempts, `looks` all camera checks of the bench before them. One
+    more query is made for each earlier version of the plan.
     """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
@@ -117,8 +118,8 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Benc
 def looked_behind(plan: Plan) -> list[dict[str, Any]]:
     """Return the recorded unblindings of the plan, its earlier versions and related plans, in order of time.
 
-    Unblindings after the end of the plan are left out. In each row `own` is True if exactly this version was unblinded,
-    and `before` if the unblinding preceded the freeze of this plan.
+    Unblindings after the end of the plan are left out. In each row, key `own` is True if exactly this version was
+    unblinded, and key `before` is True if the unblinding preceded the freeze of this plan.
     """
     of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(
         plan__in=overlapping_plans(plan)
@@ -220,10 +221,11 @@ def _accepted(images: Iterable[BenchImage]) -> dict[int, tuple[float | None, str
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Return how many trials that count each operator, or each station, made of each checkpoint.
+    """Return the number of trials that count, by operator or station and by checkpoint.
 
-    `name` is "operator" or "station". `uneven` is the largest number of trials by which one of them differs from a
-    proportional share of a checkpoint's trials. Dropped checkpoints and random order alone do not increase it.
+    `name` is "operator" or "station". Key `uneven` of the result is the largest number of trials by which an operator
+    or station differs from a proportional share of a checkpoint's trials. Dropped checkpoints and random order alone do
+    not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -307,9 +309,10 @@ def _broken_off(runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
 
 
 def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    """Return every correction of a score, and first scores given after the reveal (`late`).
+    """Return every correction of a score, and every first score given after the reveal.
 
-    `changed` is "verdict", or "category" (of a failure) or "note" if the verdict is unchanged.
+    In each dict, key `late` is True for scores after the reveal. Key `changed` is "verdict" or, if the verdict is
+    unchanged, "category" (of a failure) or "note".
     """
     by_trial, corrections = {run.trial: run for run in runs}, []
     scores = Score.objects.filter(trial__handout__plan=plan)
@@ -336,7 +339,8 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 def _amendments(plan: Plan) -> list[dict[str, Any]]:
     """Return the amendments of the plan with their reasons, newest first.
 
-    They are those that led from the first version to this one, and the one that made the next version, if there is one.
+    Included are the amendments that led from the plan's first version to this one, and the one that made the next
+    version, if there is one.
     """
     amendments, version = [], plan
     while version.amends is not None:
@@ -387,8 +391,8 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
 def _deviations(runs: Sequence[AttemptRecord], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return deviations from the schedule.
 
-    They are blocks split between stations or operators, trials out of order, time spans of blocks, and the slots that
-    stations gave back (`given_back`).
+    Included are blocks split between stations or operators, trials out of order, time spans of blocks, and the slots
+    that stations gave back (`given_back`).
     """
     blocks: dict[int, list[AttemptRecord]] = defaultdict(list)
     for run in runs:
@@ -440,7 +444,8 @@ def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
 def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     """Return the camera checks made at the plan's stations during its trials.
 
-    `unchecked` has the codes of the trials that no sufficiently recent check by the same operator preceded.
+    Key `unchecked` of the result has the codes of the trials before which the same operator made no sufficiently recent
+    check.
     """
     handed = [run.handed_at for run in runs]
     if not handed:
@@ -472,8 +477,8 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
 def _bench(plan: Plan, runs: Iterable[AttemptRecord], images: Iterable[BenchImage]) -> dict[str, Any]:
     """Return the plan's match gate, and the runs that did not demonstrably pass it.
 
-    `low` are runs with a match below the gate, `unmatched` runs without a known match, and `references` the cameras
-    whose reference image was replaced during the plan.
+    Of the result's keys, `low` has the runs with a match below the gate, `unmatched` the codes of runs without a known
+    match, and `references` the cameras whose reference image was replaced during the plan.
     """
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []

@@ -22,11 +22,12 @@ class _Tried(NamedTuple):
 def anchors_of(plan: Plan) -> list[dict[str, Any]]:
     """Return for each anchor of a frozen plan its successes by plan, and two p-values of tests for drift.
 
-    `against_earlier` compares this plan with earlier ones, `within` its first half with its second half. Each is the
-    probability that chance alone makes a difference at least as improbable as the observed one, stratified by
-    station, scene and position; it is None if nothing can be compared. An earlier plan counts if it was frozen before
-    this one, served the anchor in the same way, and is revealed or was never blind; of its trials those in scenes that
-    are identical in this plan.
+    Key `against_earlier` compares this plan with earlier ones, key `within` its first half with its second half. Each
+    p-value is the probability that chance alone makes a difference at least as improbable as the observed one,
+    stratified by station, scene and position; it is None if nothing can be compared.
+
+    An earlier plan counts if it was frozen before this one, served the anchor in the same way, and is revealed or was
+    never blind. Of its trials, only those in scenes that both plans have in identical form are used.
     """
     anchors = []
     for row in (plan.document or {}).get("checkpoints", ()):

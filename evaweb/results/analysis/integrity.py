@@ -93,9 +93,9 @@ def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
 def with_changes(scores: QuerySet[Score], **named: F) -> list[dict[str, Any]]:
     """Return the scores as dicts in the order in which they were given, with the additional fields `named`.
 
-    The queryset must contain all scores of each trial. `earlier` is the dict of the trial's previous score, None for a
-    first score; `changed` is the kind of change, VERDICT for a first score. Takes one query, and one more if a score
-    has the same success and points as the previous one.
+    `scores` must contain all scores of each trial. In each dict, key "earlier" is the dict of the trial's previous
+    score, None for a first score. Key "changed" is the kind of change, VERDICT for a first score. This takes one query,
+    and one more if a score has the same success and points as the previous one.
     """
     fields = ("pk", "trial_id", "success", "score", "failure_phase", "failure")
     rows = list(scores.order_by("pk").values(*fields, **named))

@@ -117,9 +117,11 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
 
 
 def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, Any]:
-    """Return what each design needs for the input, what the available time can detect, and power by gain.
+    """Return the answers of the calculator to the input `q`.
 
-    It is computed on behalf of `person`: nobody may use more than a share of the computing time.
+    They are the trials that each design needs, the difference that can be detected in the available time, and the power
+    of each design by gain in the success rate. The computation uses the share of computing time of `person`, which is
+    limited.
 
     Raises:
         Busy: If the share of `person` is used up.
@@ -154,8 +156,8 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
 def design_for_power(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
     """Return a design by `rule` that reaches the power, with its maximum and average trials and robot hours.
 
-    `found` is its power and number of pairs; if None, no such design exists and `pairs` is None. The averages are None
-    unless a single pair of checkpoints is compared (`alone`).
+    `found` is the power and number of pairs of that design. It is None if no such design exists; then the result has
+    None as "pairs". The averages are None unless a single pair of checkpoints is compared (`alone`).
     """
     if found is None:
         return {"rule": rule, "pairs": None}

@@ -38,8 +38,8 @@ def simulated_plans(plan: Plan) -> list[Plan]:
 def compare_with_real(real: Plan, simulated: Plan) -> dict[str, Any]:
     """Return the rates of the checkpoints that both plans tried, and how well their rankings agree.
 
-    The planned differences are estimated again with the help of the simulated trials. Trials are matched by checkpoint,
-    scene and position, in order.
+    The planned differences are estimated again with the help of the simulated trials. Each real trial is matched with a
+    simulated trial of the same checkpoint, scene and position, in the order in which they were allocated.
     """
     real_outcomes, simulated_outcomes = (
         by_checkpoint(cached_runs(plan).outcomes) for plan in (real, simulated)

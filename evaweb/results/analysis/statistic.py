@@ -1,6 +1,8 @@
-"""Declarations of statistics: each says how it is computed, written as JSON, and shown on pages and in reports.
+"""Declarations of statistics: each says how a statistic is computed, written as JSON, and shown on pages and in
+reports.
 
-They are the fields of `Arm` and `Comparison`; output is in the order of these fields (docs/contributing.md).
+The declarations are the fields of `Arm` and `Comparison`; output is in the order of these fields
+(docs/contributing.md).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ _ROW = "statistic"
 class Column:
     """Column of the table of checkpoints, on the page and in the report.
 
-    The report's program checks its cells.
+    The cells of the column are checked by the program that is part of the report.
 
     Attributes:
         head: Heading.

@@ -1,8 +1,8 @@
 """Interface of automatic judges: the case that a judge receives, and its judgement.
 
-A judge's module has `SEES` ("pictures" or "truth": it receives only that), `SERVED` (whether it sends data to an
-address, which an administrator has to allow first) and `build(setup)`, which returns a `Judge` and raises EvaError for
-an invalid set-up.
+A judge's module has three names. `SEES` is "pictures" or "truth", the only data that the judge receives. `SERVED` is
+whether the judge sends data to an address, which an administrator has to allow first. `build(setup)` returns a `Judge`,
+and raises EvaError for an invalid set-up.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class StillImage:
 class TrialCase:
     """Trial as shown to a judge, without code, checkpoint, score, plan, operator or file names.
 
-    `truth` has for each step whether the bench reports it as reached, None if it reports nothing.
+    `truth` has one entry for each of `steps`: whether the bench reports the step as reached, None if it reports
+    nothing.
     """
 
     instruction: str

@@ -278,7 +278,7 @@ def _pictures(positions: Iterable[Position]) -> dict[int, str]:
 
 
 def power_request(plan: Plan, question: Question, spread: float) -> PowerRequest | None:
-    """Return the request for the draft's power; None if it compares nothing, or no trial is planned.
+    """Return the request for the draft's power; None if the draft compares nothing, or plans no trial.
 
     `spread` is the assumed standard deviation of scores, if these are compared.
     """

@@ -175,10 +175,10 @@ def _was(request: HttpRequest) -> dict[str, Any]:
 
 
 def _shown(now: Values, last_shown: Values, faults: dict[str, str]) -> dict[str, Any]:
-    """Return the state that the page keeps for its next request.
+    """Return the state that the page keeps and sends with its next request.
 
-    The page returns `last_shown`, so that its changes can be distinguished from other people's, and, with a freeze, the
-    digest of the saved values (`now`).
+    The state has `last_shown`, from which the page's changes are distinguished from other people's, the digest of the
+    saved values `now`, which is needed to freeze the plan, and `faults`.
     """
     return {"was": json.dumps(last_shown), "seen": digest_of(now), "faults": faults}
 

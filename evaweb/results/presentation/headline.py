@@ -256,7 +256,7 @@ def _sentence(
 
 
 def _could_separate(plan: Plan, design: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
-    """Return True if this many trials could have separated the pair at all.
+    """Return True if trials as many as in `blocks` could have separated the pair at all.
 
     That is checked with the most extreme outcomes: every trial of the pair's first checkpoint succeeds, and every other
     trial fails.

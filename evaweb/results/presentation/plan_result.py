@@ -21,11 +21,11 @@ from evaweb.statistics.proportions import Proportion
 
 @dataclass(frozen=True)
 class PlanResult:
-    """Result of a plan for one request or one job; each part reads the database at its first use and is kept.
+    """Result of a plan for one request or one job.
 
-    After a write to the database a new object is needed. Whether a user may see the result has to be decided before, by
-    the module `ratings.result_visibility`. `only` selects the trials that are analysed; the conclusion is always from
-    all.
+    Each part is computed from the database when it is first used, and then kept: after a write to the database a new
+    object is needed. Whether a user may see the result has to be decided before, by the module
+    `ratings.result_visibility`. `only` selects the trials that are analysed; the conclusion is always from all trials.
     """
 
     plan: Plan

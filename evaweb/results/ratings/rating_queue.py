@@ -123,8 +123,8 @@ def next_to_rate(user: User) -> NextItem[Handout]:
 def _rated_first(change: str, trial: Trial, user: User) -> None:
     """Refuse to let a potential second rater of the trial correct the wording of its score.
 
-    Correcting first would disqualify them as a rater, and mostly for failures; and a rater must not know the score's
-    wording.
+    The correction would disqualify the user as a second rater, mostly of failures, and a second rater must not know the
+    score's wording.
 
     Raises:
         NotAllowed: If `change` is "reworded" and the user may still be asked to rate the trial.
@@ -159,8 +159,8 @@ def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
 def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> NextItem[T]:
     """Return the first item with all images, else the first whose images may still arrive.
 
-    `of` gives the trials of an item; the codes of trials whose images are missing are returned as `passed`. `waiting`
-    is read no further than necessary.
+    `of` gives the trials of an item. The attribute `passed` of the result has the codes of trials whose images are
+    missing, `left` is `count`. `waiting` is read no further than necessary.
     """
     for is_present, items in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
         passed: list[str] = []

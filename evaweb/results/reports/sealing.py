@@ -42,10 +42,10 @@ def record_to_seal(plan: Plan) -> dict[str, Any]:
 
 
 def _measured(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a digest of the measurements of all runs (`digest`), and their `names`.
+    """Return a dict with a digest of the measurements of all runs (key "digest") and their names (key "names").
 
-    `later` in the result lists the trials whose recording has not been analysed yet: the digest covers only those of
-    their measurements that need no recording.
+    Key "later" lists the trials whose recordings have not been analysed yet: of these trials, the digest covers only
+    the measurements that need no recording.
     """
     later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
     values = [

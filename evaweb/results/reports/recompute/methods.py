@@ -314,7 +314,7 @@ def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
 
 
 def score_bets(differences: Sequence[float]) -> list[float]:
-    """Return log e after each difference of scores, of a bet that their mean is above 0.
+    """Return the log wealth after each difference of scores, of a bet that the mean difference is above 0.
 
     Five gamblers with equal money and one stake each act as one gambler with the wealth-weighted mean of their stakes.
     """
@@ -347,9 +347,11 @@ def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
 
 
 def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
-    """Return the two-sided probability of a sum of differences as large as this if each sign is equally likely.
+    """Return the two-sided probability of a sum of differences as large as the observed one if each sign is equally
+    likely.
 
-    Computed in integers: the coefficients of the product of all (1 + x^d), packed into one long number.
+    The probability is computed in integers: the coefficients of the product of all (1 + x^d), packed into one long
+    number.
     """
     units: list[int] = []
     for parts in (25_200, 2_520, 420, 60, 12):
