@@ -141,6 +141,7 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(co
     ann.key("a")
     page.locator("#arm[aria-checked=false]").wait_for()
     ann.answered()
+    page.locator("#big:not([data-settling])").wait_for()
     ann.key("Enter")  # a start that does not take
     ann.said("Start: arm first")
     ann.key("1")
