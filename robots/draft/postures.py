@@ -146,10 +146,10 @@ class PostureSearch:
         return bool(self._apart(path).min() >= min(MARGIN, float(self._apart(home))) and high.all())
 
     def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
-        """Return the best posture found for one arm; the straight path to it from home is clear of collisions.
+        """Return the best posture found for one arm, with a straight path from home that is clear of collisions.
 
-        Return `start` if there is none. Cross-entropy method: sample postures, keep the best, sample around them;
-        restarted from random centres.
+        Cross-entropy method: sample postures, keep the best, sample around them. The search is repeated from another
+        random centre until the path to its best posture is clear; return `start` if no search succeeds.
         """
         for _ in range(_STARTS):
             best = self._refined(arm, start, home)
