@@ -17,10 +17,11 @@ from robots.urdf import Joint, Urdf
 
 
 class BodyTables(NamedTuple):
-    """Tables of the joints between parts [P]: a part's joint has the value coupling . q + offset, within its bounds.
+    """Tables from which the poses of P parts follow; row p belongs to part p and to the joint that moves it.
 
-    A part's transform relative to the part `above` it (-1: the scene; parents come first) is the sum of its four
-    `motions` [P, 4, 16], weighted by 1, by the cosine and sine of that value, and by the value itself.
+    The value of the joint is `coupling` . q + `offsets`, clipped to `low` and `high`. The part's transform relative to
+    its parent is the sum of the four matrices `motions` [P, 4, 16], weighted by 1, by the cosine and the sine of the
+    value, and by the value itself. `above` is the index of the parent, -1 for the scene; parents come first.
     """
 
     motions: Float64

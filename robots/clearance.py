@@ -134,9 +134,9 @@ class Clearance:
         )
 
     def _telling(self, robot: Robot) -> tuple[_Indices, _Indices, _Indices]:
-        """Return the informative pairs, as `_select_pairs` takes them.
+        """Return the pairs that are informative, in the form of the three arguments of `_select_pairs`.
 
-        Their links do not touch at nearly every posture, and their distance to the table varies.
+        Pairs that touch at nearly every posture are left out, as are parts whose distance to the table does not vary.
         """
         lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
         upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)

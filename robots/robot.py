@@ -46,12 +46,16 @@ class Gripper:
 class Group:
     """Joints that are sent together; `joints` are their names in messages, `slice` their indices in the robot's vector.
 
-    `urdf_joints` name the same joints in the URDF, without the gripper, "" for numbers that move no link. An arm has an
-    end effector `eef_link`, whose pose is stated in `frame`. Its `chain` of own joints begins at `frame` or, if other
-    groups move joints in between (a torso), at the end of `carrier`, which begins at `frame` and is driven by
-    `carrier_dims` of the robot's vector. `mount` [7] (x, y, z, qw, qx, qy, qz) is the pose of the root of the group's
-    URDF copy in the robot's mount frame. `tip` [4, 4] is the frame between the fingertips in `eef_link`, z in the
-    direction in which they point, y in the opening direction; None without a gripper.
+    `urdf_joints` name the same joints in the URDF, without the gripper, "" for numbers that move no link.
+
+    An arm has an end effector `eef_link`, whose pose is stated in `frame`. Its `chain` contains only its own joints,
+    and usually begins at `frame`. If joints of other groups (a torso) lie between `frame` and the arm, they form the
+    `carrier`: a chain that begins at `frame`, ends where `chain` begins, and is driven by the dimensions `carrier_dims`
+    of the robot's vector.
+
+    `mount` [7] (x, y, z, qw, qx, qy, qz) is the pose of the root of the group's URDF copy in the robot's mount frame.
+    `tip` [4, 4] is the frame between the fingertips in `eef_link`, z in the direction in which they point, y in the
+    opening direction; None without a gripper.
     """
 
     name: str

@@ -47,8 +47,9 @@ class GripperDraft:
 def end_link(tree: Urdf, limb: GroupGuess) -> str:
     """Return the end effector of an arm.
 
-    With fingers it is a link after the last joint that is named as for grasping, else the link that carries the
-    fingers. Without, it is a leaf after the last joint with a typical name, else the link that the last joint moves.
+    Candidates are the link that the last joint moves and the links that are fixed to it. For an arm with fingers it is
+    a candidate that is named like a frame for grasping, else the link that carries the fingers. For an arm without
+    fingers it is a candidate without children and with a typical name, else the link that the last joint moves.
     """
     last = tree.joint(limb.joints[-1]).child
     if limb.fingers:

@@ -164,6 +164,12 @@ def _limbs(
     """Return the limbs that an unbranched row of joints forms.
 
     A torso or base that leads to an arm without branching is a separate limb.
+
+    Args:
+        skeleton: Tree of the joints.
+        run: The joints, and True if no joint follows the last one.
+        fingers: The joint that carries the hand, by finger joint.
+        alone: True if there is no other row of joints, so that a shorter one counts as an arm.
     """
     joints, ends = run
     own = tuple(name for name, carrier in fingers.items() if carrier == joints[-1])

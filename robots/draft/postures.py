@@ -124,7 +124,10 @@ class PostureSearch:
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
 
     def _heights(self, q: Float64) -> Float64:
-        """Return the heights of the fingertips over the table [..., arms], which are not among the checked pairs."""
+        """Return the heights of the fingertips over the table [..., arms].
+
+        They are computed separately, because fingertips and table are not among the checked pairs.
+        """
         return (
             np.stack([self._tips(arm, q)[..., 2, 3] for arm in self._arms], axis=-1) if self._arms else _NONE
         )
@@ -143,10 +146,10 @@ class PostureSearch:
         return bool(self._apart(path).min() >= min(MARGIN, float(self._apart(home))) and high.all())
 
     def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
-        """Return the best posture found for one arm that a straight path from home reaches clear of collisions.
+        """Return the best posture found for one arm, with a straight path from home that is clear of collisions.
 
-        `start` if none is found. Cross-entropy method: sample postures, keep the best, sample around them; restarted
-        from random centres.
+        Cross-entropy method: sample postures, keep the best, sample around them. The search is repeated from another
+        random centre until the path to its best posture is clear; return `start` if no search succeeds.
         """
         for _ in range(_STARTS):
             best = self._refined(arm, start, home)

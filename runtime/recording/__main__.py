@@ -161,9 +161,9 @@ def _lower_priority() -> None:
 
 
 def _end_with_standard_input() -> None:
-    """End the process when standard input closes, whose other end the starting process holds.
+    """End the process when standard input closes, because the process that started it holds the other end.
 
-    A half-written file is only a draft.
+    An export that is being written is lost, but no damage results: it is only a draft until it is complete.
     """
     while os.read(0, 4096):
         pass

@@ -19,7 +19,7 @@ from runtime.recording.layout import Layout
 class RecordedRow(NamedTuple):
     """Row without its pictures, and the cameras whose video frame repeats the previous one.
 
-    `lost` are those of the `repeated` cameras that did have a new picture, which is missing in their video.
+    `lost` are the cameras among `repeated` for which the row had a new picture, which is missing in the video.
     """
 
     row: Row
@@ -149,7 +149,10 @@ def _vectors(values: Sequence[Float32 | None], width: int) -> Any:
 
 
 def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> list[list[Any] | None]:
-    """Return one list of values per row of every chunk, None for the rows of chunks without values."""
+    """Return for each row of all chunks the list of its values by arm; None if its chunk has no values.
+
+    `figures` has the values [rows, arms] of each chunk, or None, and `lengths` the number of rows of each chunk.
+    """
     rows: list[list[Any] | None] = []
     for figure, length in zip(figures, lengths, strict=True):
         rows += [None] * length if figure is None else figure.tolist()

@@ -25,8 +25,8 @@ class Picture(NamedTuple):
 def encode_count(repeats: int) -> int:
     """Return how many of `repeats` successive repeats must be encoded; the remaining frames are copies of encoded ones.
 
-    Copies alternate between two encoded key frames and come in pairs, so if the number is odd, one more repeat is
-    encoded before them.
+    Fewer than RUN repeats are all encoded. Otherwise two key frames are encoded, of which copies are appended
+    alternately and in pairs; if `repeats` is odd, one more repeat is encoded before them.
     """
     return repeats if repeats < RUN else 2 + repeats % 2
 
@@ -92,7 +92,7 @@ class PictureQueue:
             return entry
 
     def report_encoded(self, codings: int, seconds: float) -> None:
-        """Report the coding time of an entry, for the pace."""
+        """Report that coding `codings` frames of an entry took `seconds`, from which the present pace is computed."""
         with self._changed:
             self._pace.update(codings, seconds)
 

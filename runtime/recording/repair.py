@@ -205,10 +205,9 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 
 
 def _unproven(path: Path, closed: bool) -> str:
-    """Return a sentence that the episode had been closed before, so that facts of its end are lost.
+    """Return a sentence if the episode had been closed before, so that facts about its end are lost; "" if not.
 
-    "" without a sign of that. Signs are an export of the episode, and, as `closed` states, that all its tables have an
-    end mark.
+    It had been closed if there is an export of it, or if all its tables have an end mark, as `closed` states.
     """
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None

@@ -51,7 +51,10 @@ class ErrorLatch:
 
 
 class DiskWriter:
-    """Writer of the tables and events of one episode; they are synced together with `others` every flush period."""
+    """Writer of the tables and events of one episode.
+
+    Every flush period it syncs its files and `others`, which are files that other threads write.
+    """
 
     def __init__(
         self,

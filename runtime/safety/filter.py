@@ -191,8 +191,10 @@ class SafetyFilter:
         return "" if pair is None else str(pair)
 
     def _warned(self, verdict: SafetyVerdict, path: Path) -> SafetyVerdict:
-        """Return `verdict`; if collisions are only warned of, with the pair of links that the action brings near each
-        other.
+        """Return `verdict`, with a warning added if the action brings two links near each other.
+
+        This is done only for a policy's actions, and only if the settings demand warnings of collisions instead of
+        refusals.
         """
         if self._collisions is None or path == "motion" or self._settings.collision != "warn":
             return verdict

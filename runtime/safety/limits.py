@@ -16,8 +16,8 @@ GRIPPER_TRAVEL = 6.7
 class Limits:
     """Bounds of a robot, float64 [D] each; `binary` marks dimensions that switch between two values.
 
-    `speeds` are the indices of dimensions that are speeds (of a mobile base): 0 is standstill, and their `velocity`
-    is an acceleration.
+    `speeds` are the indices of dimensions that are speeds (of a mobile base) instead of positions: 0 is standstill, and
+    their entries in `velocity` are limits of acceleration.
     """
 
     names: tuple[str, ...]

@@ -29,9 +29,9 @@ _LONGEST = 2000  # rows per chunk, as received and at control rate: IK is sequen
 class ChunkStart:
     """Point at which a chunk takes over from the present command; vectors float64 [D].
 
-    `commanded` is the present command: grippers and joints that the rows do not contain hold it. `previous_command` is
-    the command of the step before row `first_row`, the first row that will be executed: from that row on the solved
-    joints respect their velocity limits. For a robot at rest `previous_command` is the measured position.
+    `commanded` is the present command. Grippers and joints that the chunk's rows do not contain stay there. `first_row`
+    is the first row that will be executed, and `previous_command` the command of the step before it, or the measured
+    position of a robot at rest. From `first_row` on, the solved joints respect their velocity limits.
     """
 
     commanded: Float64
@@ -94,12 +94,18 @@ class ActionSpaces(EndEffectors):
     ) -> CommandRows:
         """Convert a chunk that was computed from `observation` to absolute joint rows at control rate.
 
-        The steps, in order: check the rows; decode poses from their format; make them absolute with the observation
-        (poses with its poses, or with those of its joints, in the declared frame); snap binary grippers, with
-        hysteresis from the present command; resample; solve poses, row 0 from the observed joints, each further row
-        from its predecessor; unwrap joints without limits from the observed joints on. Solved joints respect velocity
-        limits from `onset` on; without `onset` the robot is assumed to be at rest at the observed joints. Other
-        grippers are copied. Joints that the rows do not contain hold `onset.commanded`.
+        The steps, in order:
+
+        * Check the rows, and decode poses from their format.
+        * Make relative rows absolute: joints with the observed joints, poses with the observed poses or, without these,
+          with the poses of the observed joints, in the declared frame.
+        * Snap binary grippers, with hysteresis from the present command. Other grippers are copied.
+        * Resample to the control rate.
+        * Solve poses: row 0 from the observed joints, each further row from its predecessor. Solved joints respect
+          velocity limits from `onset` on; without `onset` the robot is assumed to be at rest at the observed joints.
+        * Unwrap joints without limits from the observed joints on.
+
+        Joints that the rows do not contain hold `onset.commanded`.
 
         Raises:
             PolicyError: Wrong width, a number that is not finite, or numbers that determine no orientation.

@@ -99,7 +99,8 @@ class EulerAngles(Orientation):
     """Three angles in one of the twelve orders: "xyz" about fixed axes, "XYZ" about moving axes.
 
     They are computed from a quaternion as in Bernardes and Viollet, PLoS ONE 17 (2022) e0276302. In a gimbal lock one
-    angle is free: the third is then left unchanged (0 at the first row).
+    angle is free: the third angle about fixed axes, or the first about moving axes, then keeps its value from the
+    previous row (0 if there is none).
     """
 
     allowed = "any three angles"
@@ -145,7 +146,11 @@ class EulerAngles(Orientation):
     def _angles(
         self, total: Float64, apart: Float64, along: Float64, across: Float64, before: Float64 | None
     ) -> Float64:
-        """Return the angles [arms, 3] about fixed axes that are closest to `before` [arms, 3]."""
+        """Return the angles [arms, 3] about fixed axes that are closest to `before` [arms, 3].
+
+        The first four arguments are those that `_terms` returns, for one row. If `before` is None, the angles are in
+        [-pi, pi].
+        """
         third = np.zeros(len(total)) if before is None else self._raw(before[:, 2])
         total = np.where(along <= _LOCKED, third - apart, total)
         apart = np.where(across <= _LOCKED, third - total, apart)

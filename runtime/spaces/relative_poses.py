@@ -17,9 +17,10 @@ _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 def to_absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
     """Return absolute poses for relative `vectors` (unit quaternions); `start` [arms, 8] is the pose at the start.
 
-    Mode "relative": each row is relative to `start`; "delta": to its predecessor. Frame "base": p0 + dp, dq q0; "tool":
-    p0 + R0 dp, q0 dq. Grippers are absolute in every mode and are copied. Quaternions are returned unit and
-    sign-continuous, w >= 0 in the first row.
+    In the mode "relative" each row (dp, dq) is relative to `start`, in the mode "delta" to its predecessor. If that
+    pose has the position p0, the quaternion q0 and the rotation matrix R0, the absolute row is (p0 + dp, dq q0) in the
+    frame "base", and (p0 + R0 dp, q0 dq) in the frame "tool". Absolute `vectors` are returned unchanged. Grippers are
+    absolute in every mode and are copied. Quaternions are returned unit and sign-continuous, w >= 0 in the first row.
     """
     if mode == "absolute":
         return vectors

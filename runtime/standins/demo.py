@@ -21,8 +21,9 @@ _DEPLOYMENT = Path(__file__).parents[2] / "deployments" / "demo.toml"
 
 
 class StandIns:
-    """Child processes of the demo: node and policy server; they end when their standard input closes, so with the
-    demo.
+    """Child processes of the demo: node and policy server.
+
+    They end when their standard input closes, and therefore also when the demo ends in any way.
     """
 
     def __init__(self) -> None:

@@ -75,8 +75,9 @@ class OpenpiServer(WebsocketServer):
         answer.previous_ms = 1e3 * seconds
 
     def failure(self, traceback: str, request: Frames) -> Frames:
-        """Return the frame that reports an error: its text, or with RTC envelopes an envelope with the request's
-        number.
+        """Return the frame that reports an error: the traceback as text.
+
+        If the server uses the RTC format with envelopes, it is an envelope with the traceback and the request's number.
         """
         try:
             message = unpacked(request) if isinstance(request, bytes) else None

@@ -93,9 +93,9 @@ def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _requested_settings(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> dict[str, Any]:
-    """Return the configuration with the options of the run that the manifest names.
+    """Return the configuration with the options of the run that the manifest names, and with `data` as data folder.
 
-    Episodes of the mode "observe" are not runs: their options stay out.
+    The options of an episode of the mode "observe" are not used, because it is not a run.
     """
     run = tree.get("run")
     if isinstance(run, dict) and manifest.get("mode") != "observe":

@@ -30,7 +30,8 @@ CAPABILITIES = TypeAdapter(Capabilities)
 class StationSpec:
     """Deployment with its robot and everything known of both before connecting; plain values.
 
-    `collecting`: the station is set up to collect, so that the policy is the leader of its [collection].
+    If `collecting`, the station is set up to collect demonstrations, and the leader in the deployment's [collection]
+    takes the place of the policy.
     """
 
     resolved: Resolved

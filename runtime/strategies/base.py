@@ -145,8 +145,9 @@ def join(
 ) -> MergeResult:
     """Merge a chunk by its strategy; fade over if it does not continue the motion, so that no strategy causes a jump.
 
-    If the chunk is dropped, nothing is changed. Chunks may be merged while a fade is active: it continues over the new
-    plan. The contributions of every step sum to 1; chunk id HELD is a held target.
+    If the chunk is dropped, nothing is changed. Chunks may be merged while a fade is active: the fade then continues to
+    the new plan. The contributions of every step sum to 1; chunk id HELD is a held target. Unless `held` is given,
+    `joining` is True or the chunk is mistimed, the strategy alone decides.
 
     Args:
         merge: The strategy's merge.
@@ -156,9 +157,9 @@ def join(
         held: Target [D] that is held because nothing was planned (starvation, a distant first chunk of a run), or None.
         The chunk takes over from it within JOIN_WINDOW steps, or within its own length if that is shorter.
         dims: Dimensions that do not blend linearly.
-        joining: True if the kind of strategy was changed since the last merged chunk; the caller passes True until a
-        chunk is not dropped. The new plan then takes over from the old plan, whose last target is held as long as
-        needed, or from `commanded` if nothing is planned. Without `held` and `joining` the strategy alone decides.
+        joining: True if no chunk has been merged since the kind of strategy was changed. The new plan then takes over
+        from the old plan, whose last target is held as long as needed, or from `commanded` if nothing is planned. The
+        caller passes True again until a chunk is not dropped.
         commanded: Last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole turn.
     """
     placed = merge.place(timeline, arrival, free_step)

@@ -22,11 +22,12 @@ class Config(StrategyParameters):
 
 
 class EnsembleMerge(Merge):
-    """Merge by the weighted mean, step by step, of the chunks that cover it; weight exp(-m * rank), rank 0 the oldest.
+    """Merge in which each step is the weighted mean of all chunks that cover the step.
 
-    Chunks are not cropped, and each row is used at its intended step; of more than `horizon` chunks the newest take
-    part. The timeline stores the chunks that still cover a step. The mean is computed as the newest chunk plus weighted
-    differences, so that equal chunks average to themselves exactly.
+    The weight is exp(-m * rank), where the oldest chunk has rank 0. Chunks are not cropped, and each row is used at its
+    intended step. The timeline stores the chunks that still cover a step, but at most the newest `horizon` chunks; the
+    others no longer take part. The mean is computed as the newest chunk plus weighted differences, so that equal chunks
+    average to themselves exactly.
     """
 
     def __init__(self, k_max: int | None, m: float, horizon: int, dims: DimensionKinds) -> None:

@@ -45,9 +45,11 @@ class LeaderPolicy(Policy):
     """Policy that follows a leader: to its pose ("absolute"), or by its motion since the engagement ("relative").
 
     The engagement is the first request after a reset or a hold; motion of the leader before it has no effect. Grippers
-    are absolute in both modes. Joints of groups that the leader lacks remain where they were at the engagement: at
-    their commanded position if that is within `steady_error` of the measured position, because starting from the
-    measured position would let gravity lower the arm at each engagement.
+    are absolute in both modes.
+
+    Joints of groups that the leader lacks remain where they were at the engagement. That is their commanded position if
+    it is within `steady_error` of the measured position, otherwise the measured position. Starting from the measured
+    position in every case would let gravity lower the arm at each engagement.
     """
 
     uses_images = False

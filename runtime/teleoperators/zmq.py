@@ -57,7 +57,7 @@ def build(config: Config, robot: Robot, clock: Clock) -> ZmqLeader:
 
 
 class ZmqLeader(Leader):
-    """Leader that a thread receives on a SUB socket that keeps only the newest message.
+    """Leader whose messages a thread receives on a SUB socket, which keeps only the newest message.
 
     A message with the `t` of its predecessor is not new: a publisher that only repeats itself counts as silent.
     """

@@ -27,7 +27,7 @@ class Capabilities:
 
 
 class Source(ABC):
-    """Source of observations; of several, the one that arrived last is the newest."""
+    """Source of observations; the newest observation is the one that arrived last."""
 
     @abstractmethod
     def connect(self) -> None:

@@ -61,9 +61,9 @@ class TickSettings:
 
 
 class TickResult(NamedTuple):
-    """Result of one tick: `target` is the behaviour's target, `executed` float64 [D] the action that was sent.
+    """Result of one tick: `target` is the target of the behaviour, `executed` float64 [D] the action that was sent.
 
-    Each is None if there was none.
+    `target` is None if the behaviour had none, `executed` if nothing was sent.
     """
 
     time: float  # our monotonic clock [s]
@@ -132,10 +132,10 @@ class Actuator(ABC):
         self.commanded = snap_grippers(self._settings.switches, self.commanded, self.commanded)
 
     def rebase_command(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
-        """Restart the command at `measured`, at most `farthest` [D] from the last command.
+        """Restart the command at `measured`, but move each joint by at most `farthest` [D].
 
-        No other method lets the command jump; it jumps towards the robot, so that nothing pulls the robot. The tick
-        record carries `why`.
+        No other method lets the command jump. The jump is towards the measured position, so that it does not pull the
+        robot. The tick record contains `why`, the reason.
         """
         before = self.commanded
         self.engage(before + np.clip(measured - before, -np.asarray(farthest), farthest))
@@ -173,7 +173,12 @@ class Actuator(ABC):
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
     ) -> TickResult:
-        """Send `action`, which locks and safety derived from `target`; return the result of the tick."""
+        """Send `action` at tick `step`, planned for time `planned`; return the result of the tick.
+
+        `action` [D] is the behaviour's `target` after the gripper locks and the safety filter; `notes` are their
+        remarks on changes, and are copied to the result. If the e-stop was pressed since the beginning of the tick, the
+        last command is sent again instead.
+        """
         elapsed = self.elapsed(planned)
         stop = target.source == "estop"
         if self._estop_pressed and not stop:

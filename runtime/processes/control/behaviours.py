@@ -14,10 +14,10 @@ from runtime.safety.filter import Path
 
 
 class Target(NamedTuple):
-    """Target of a behaviour for one tick, float64 [D], with the limits that apply to it.
+    """Target of a behaviour for one tick: `action` float64 [D].
 
-    If `path` is None, the target is part of braking or holding: safety does not check it, because a refusal would leave
-    nothing to send.
+    `path` selects the safety limits that apply to it. If `path` is None, the target is part of braking or holding.
+    Safety does not check such a target, because after a refusal there would be nothing to send.
     """
 
     action: Float64
@@ -114,11 +114,13 @@ class MoveTo(Behaviour):
 class EStopHold(Behaviour):
     """Behaviour that sends the position at which the robot comes to rest, or the last command if that is unknown.
 
-    Joints within their steady error keep their command. The command of all other joints follows the measurement for
-    `_FOLLOWS_S`, while the arm comes to rest: with the offset of their last steady error, and within the stopping
-    distance of the first measurement. After that it is constant: an arm that is sent its own measurement sinks under
-    its weight. `position` float64 [D] is None if the robot was never measured: nothing is sent then. `rest` [D] is the
-    stopping distance.
+    Joints with a steady servo error keep their command. For all other joints, the command follows the measurement for
+    `_FOLLOWS_S`, while the arm comes to rest: it is the measured position plus the joint's last steady error, and stays
+    within the stopping distance of the first measurement. After `_FOLLOWS_S` the command is constant, because an arm
+    that is always sent its own measured position sinks under its weight.
+
+    `position` float64 [D] is the position to send; if it is None, because the robot was never measured, nothing is
+    sent. `rest` [D] is the stopping distance.
     """
 
     name = "estop"

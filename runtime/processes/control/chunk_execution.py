@@ -136,8 +136,9 @@ class ExecuteChunks(Behaviour):
         """Merge a chunk into the plan from `step` on, the first step not sent yet.
 
         `commanded` [D] is the newest command. After this call the run no longer waits for its first chunk, even if this
-        chunk was dropped. If the dropped chunk was requested while the robot was stopped, an empty plan no longer
-        counts as waiting either. So a policy whose chunks are all dropped starves the run.
+        chunk was dropped. If a dropped chunk was requested while the robot was stopped, an empty plan counts as
+        starvation from then on, and not as waiting: otherwise a policy whose chunks are all dropped would let the run
+        wait forever.
         """
         try:
             joined = self._join(chunk, step, commanded)
@@ -208,7 +209,7 @@ class ExecuteChunks(Behaviour):
     def _first_action_distance(self, row: Float64, commanded: Float64) -> tuple[float, str]:
         """Return how far `row` [D], a run's first action, is from `commanded` [rad], and a description.
 
-        0 and "" for later actions, and if safety only reports.
+        Return 0 and "" if the run has had its first chunk already, or if safety only reports.
         """
         settings = self._settings
         if not self._expecting or settings.safety.report_only:

@@ -48,10 +48,11 @@ class DisplacementMonitor:
     measurements: sending the old target would move it unexpectedly. A single sample is not enough: several must agree
     (`JointPlausibility.is_displaced`).
 
-    An encoder with an offset looks the same, but there the joint follows its command, so that the displacement remains.
-    Therefore the command does not follow a joint whose reading jumped until reading and command have agreed for
-    _AGREES_S. A displacement that remains after the command has followed the joint is not followed again before the
-    next set-up, because the operator must check the robot.
+    An encoder with an offset causes the same readings. In that case moving the command moves the joint too, so that the
+    distance between reading and command remains. Therefore the command does not follow a joint whose reading jumped,
+    until reading and command have agreed for _AGREES_S. If a joint is still displaced after its command has been moved
+    to the reading, the command does not follow it again before the next set-up, because the operator must check the
+    robot.
 
     A held arm may be displaced by the permitted following error. Under the e-stop, the command of an arm at rest
     already follows a displacement of 0.1 rad: an arm whose drive is off has sagged, and would jump back when the drive
@@ -91,7 +92,7 @@ class DisplacementMonitor:
     ) -> Float64 | None:
         """Return the new command [D] if the robot is too far from its held position, None if it is not.
 
-        Call once per tick. `held`: the robot holds a position; `stopped`: the e-stop holds it.
+        Call once per tick. `held` is True if the robot holds a position, `stopped` if it holds because of the e-stop.
         """
         self.begins = False
         self._note_moves(robot, now)
@@ -189,8 +190,8 @@ class DisplacementMonitor:
     def speed(self) -> Float64:
         """Velocity limit with which the command converges to the measured joints [D].
 
-        Joints that converge in one piece, without rests, have their full limit, all other joints that of generated
-        motions.
+        For joints that converge without rests it is their full velocity limit, for all other joints the limit of
+        generated motions.
         """
         whole = False if self._meeting or self._led is None else self._led.whole
         return self._settings.limits.velocity * np.where(
@@ -206,7 +207,10 @@ class DisplacementMonitor:
         self._meeting = True
 
     def stop_converging(self) -> None:
-        """Stop moving the hold target when the set-up has ended; with an encoder offset it would move the robot."""
+        """Stop moving the hold target to the measured joints, because the set-up has ended.
+
+        If an encoder had an offset, following its readings further would move the robot.
+        """
         if self._meeting:
             self._meeting, self.goal = False, None
 
@@ -227,8 +231,8 @@ class DisplacementMonitor:
     def _finish(self, robot: RobotActuator) -> None:
         """End the convergence, and decide for each joint whether its command may follow its reading again later.
 
-        It may if the joint was proven to move independently of the command. If the convergence proved nothing, it may
-        until this has happened _VERDICTS times.
+        It may if the joint was proven to move independently of the command. If a convergence ends without proof for a
+        joint, it may as well, but only until _VERDICTS convergences have ended so.
         """
         assert self._led is not None
         verdict = np.where(self._blind, 1, self._led.verdict)

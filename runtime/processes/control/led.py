@@ -16,12 +16,14 @@ _THERE = 1e-6
 class Led:
     """Convergence of a command to the measured joints, in parts with a rest after each, until two parts agree.
 
-    It distinguishes a joint that is moved by hand from one whose encoder has an offset. Readings of the former do not
-    depend on the command; readings of the latter follow the command, and rest (or drift on) when it rests. The
-    criterion is how far readings moved during a part, beyond what their speed before and after the part explains: if
-    that is more than half of the command's motion in two parts, the encoder has an offset. A part is inconclusive if
-    the readings' speed changed during it, as with a hand that moves to and fro, unless the readings moved against the
-    command.
+    It distinguishes a joint that is moved by hand from a joint whose encoder has an offset. The readings of a joint
+    moved by hand do not depend on the command. The readings of an encoder with an offset follow the command, and rest
+    (or drift on) when the command rests.
+
+    For each part, the motion of the readings is compared with the motion that their speed before and after the part
+    explains. If in two parts the readings moved with the command by more than that, and the excess is more than half of
+    the command's motion, the encoder has an offset. A part is inconclusive if the readings' speed changed during it, as
+    with a hand that moves to and fro, unless the readings moved against the command.
     """
 
     def __init__(
@@ -36,9 +38,14 @@ class Led:
     ) -> None:
         """Start at `commanded` [D], with readings at `measured` [D] that move at `speed` [D] by themselves.
 
-        `at_once`, bool [D], marks joints that converge without parts and rests: during these a re-energised arm would
-        be pulled back, and a blocked arm would press on. `along`, int [D], is the number of parts of earlier
-        convergences in which readings moved with the command.
+        Args:
+            commanded: Command at the start [D].
+            measured: Readings at the start [D].
+            speed: Velocity of the readings at the start [D].
+            now: Present time [s].
+            at_once: Joints that converge without parts and rests, bool [D]. During a rest, the command would pull back
+            an arm whose drive is switched on again, and a blocked arm would continue to press.
+            along: Number of parts of earlier convergences in which the readings moved with the command, int [D].
         """
         self.at_once = np.broadcast_to(np.asarray(at_once, bool), commanded.shape)
         self.along: np.ndarray = np.zeros(len(commanded), np.int64) + along
@@ -71,7 +78,11 @@ class Led:
     def update(
         self, commanded: Float64, measured: Float64, goal: Float64, speed: Float64, now: float
     ) -> np.ndarray:
-        """Evaluate the readings after each part and its rest; return joints that moved with the command, bool [D]."""
+        """Evaluate the readings after each part and its rest; return the joints that moved with the command, bool [D].
+
+        A joint is among them as soon as it moved with the command in enough parts, including those of earlier
+        convergences.
+        """
         off = np.asarray(self.along >= _SAY)
         if np.abs(self.end(goal) - commanded).max(where=~self.whole, initial=0.0) > _THERE:
             return off

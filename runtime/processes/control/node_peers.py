@@ -60,7 +60,7 @@ Say = Callable[[str, str, Mapping[str, object]], None]
 
 
 class SubscriberCheck:
-    """Monitor of command topics without a subscriber: emits an event when they change.
+    """Monitor of command topics without a subscriber, which emits an event when the set of these topics changes.
 
     The event's data lists all of them under `unheard`.
     """

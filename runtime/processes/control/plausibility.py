@@ -96,11 +96,12 @@ class _Chain:
 class JointPlausibility:
     """Plausibility check of each joint sample against earlier samples.
 
-    A sample is trusted if no joint is beyond its limits or has moved faster than possible since the last trusted
-    sample. Contradicting samples that agree with each other for CONSISTENT_S replace the trusted ones, later if
-    contradictions repeat; never if a joint jumped to exactly 0 or joints exchanged their values. A joint with the
-    same number for `_FROZEN_S` while its command moves is frozen. Grippers and speeds are not checked. The first
-    samples, and those after an outage of UNSEEN_S, can only be checked for agreement with each other.
+    A sample is trusted if no joint is beyond its limits, and none has moved faster than possible since the last trusted
+    sample. Samples that contradict the trusted samples, but agree with each other for CONSISTENT_S, replace them; the
+    required time grows if contradictions repeat. Samples in which a joint jumped to exactly 0, or joints exchanged
+    their values, never replace trusted samples. A joint counts as frozen if its reading has been the same number for
+    `_FROZEN_S` while its command moved. Grippers and speeds are not checked. The first samples, and those after an
+    outage of UNSEEN_S, can only be checked for agreement with each other.
     """
 
     def __init__(self, limits: Limits, dims: DimensionKinds) -> None:
@@ -129,7 +130,7 @@ class JointPlausibility:
         self.dead = ""
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
-        """Return `seen`, with the reason if its joints are implausible.
+        """Return `seen` unchanged, or with the reason added if its joints are implausible.
 
         `commanded` float64 [D] is the command of a robot that is being moved, None otherwise.
         """
@@ -293,7 +294,7 @@ class JointPlausibility:
     def _permanent_reason(self, sample: _Sample) -> str:
         """Return the reason why samples from this one on are never trusted, "" if there is none.
 
-        It is phrased as a question, because numbers alone do not decide it.
+        The reason is phrased as a question, because numbers alone cannot prove it.
         """
         if self._chain is None:
             return ""

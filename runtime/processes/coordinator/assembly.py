@@ -55,7 +55,13 @@ def assemble(
 ) -> Coordinator:
     """Return the coordinator of a station.
 
-    `people` is the clock of leases and of the validity of commands; None: `clock`.
+    Args:
+        spec: Specification of the station.
+        shared: Shared state of the station's processes.
+        clock: Clock of the runtime.
+        runner: Executor of the calls to the policy.
+        people: Clock of leases and of the validity of commands; None for `clock`.
+        make_policy: Constructor of the policy.
     """
 
     # Callbacks of components to the coordinator, which does not exist yet.

@@ -48,7 +48,18 @@ class ControlQueue:
         mode: Mode = "continuous",
         speed: float = 1.0,
     ) -> int:
-        """Send an order; return its number, which control's status contains once it is obeyed."""
+        """Send an order; return its number, which appears in control's status once control obeys the order.
+
+        An order that control does not read is lost, and that is logged.
+
+        Args:
+            kind: Kind of the order.
+            run: Number of the open run; 0 if there is none.
+            goal: End of a motion [D]; NaN for dimensions that stay where they stop. None for other orders.
+            reason: Why the order is sent.
+            mode: Mode of the run that control is to follow.
+            speed: Share of the speed of generated motions that a motion may use.
+        """
         self._number += 1
         try:
             self._push(Order(self._number, kind, run, goal, reason, mode, speed))

@@ -113,7 +113,7 @@ class HealthMonitor:
     def poll(self, state: SessionState, run: Run | None) -> Iterator[HealthEvent]:
         """Yield events for the session.
 
-        `state` is the session's state before the first of them, `run` the open run.
+        `state` is the session's state before the first of these events, `run` the open run.
         """
         yield from self._check_heartbeats(state)
         yield from self._estop(state)

@@ -147,7 +147,7 @@ class SessionActions:
         self.command: str = ""  # the present command's uuid
 
     def set_requester(self, by: str, command: str) -> None:
-        """Record client `by` and uuid of the command that is executed next."""
+        """Record who requests the command that is executed next: the client `by`, and the command's uuid `command`."""
         self.by, self.command = by, command
 
     # --- set-up and runs -------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ class PathCheck:
     def check(self, what: str, start: Float64, goal: Float64) -> None:
         """Raise RuntimeFault if links collide on the path from `start` to `goal` [D], or if it leaves a workspace box.
 
-        `what` begins the message. A box is left only by a path that was inside it.
+        `what` begins the message. A path that begins outside a box cannot leave it before it has been inside.
         """
         path = self._path(start, goal)
         if arm := self._workspace.arm_leaving_on(path):

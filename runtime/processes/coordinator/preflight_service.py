@@ -39,7 +39,8 @@ PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
 class PreflightService:
     """Preflights of the coordinator.
 
-    `in_force` returns the specification of the last set-up; `own` is that of the deployment, which preflights check.
+    `in_force` returns the specification of the last set-up. `own` is the specification of the deployment, which
+    preflights check.
     """
 
     def __init__(
@@ -90,9 +91,10 @@ class PreflightService:
         return {"id": request.id, "longest_s": longest}
 
     def _require_free(self, request: PreflightRequest) -> None:
-        """Raise RuntimeFault if the station is at work.
+        """Raise RuntimeFault if the preflight would disturb the station.
 
-        Also if it is ready, and the preflight would use its exclusive policy server.
+        That is so if the station is at work. It is also so if the station is ready, the preflight would use its policy
+        server, and this server keeps the state of only one client.
         """
         state = self._state()
         if state.meaning.at_work:

@@ -19,8 +19,9 @@ from runtime.station.spec import StationSpec
 def build_snapshot(of: Components, inbox: Inbox) -> dict[str, Any]:
     """Return the station's state; times in seconds on the runtime's clock, ages in seconds.
 
-    "clock" is the clock of command validity; in lockstep it continues while the runtime's clock is stopped.
-    "sentences" has id and arguments of texts that have them, by path: "reason", "guarded.run".
+    "clock" is the clock of command validity; in lockstep it continues while the runtime's clock is stopped. "sentences"
+    maps the path of each translatable text in the snapshot, such as "reason" or "guarded.run", to the text's id and
+    arguments.
     """
     snapshot = _snapshot(of, inbox)
     changing = {key: value for key, value in snapshot.items() if key != "facts"}

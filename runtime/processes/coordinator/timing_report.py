@@ -16,7 +16,10 @@ _LOOK_S = 1.0
 
 
 class TimingReport:
-    """Monitor of control's timing statistics, once a second; `asked`: control should run in the real-time class."""
+    """Monitor that checks control's timing statistics once a second.
+
+    `asked` is True if the deployment requests the real-time scheduling class for control.
+    """
 
     def __init__(self, shared: SharedState, rate: float, priority: int, asked: bool) -> None:
         self._shared_state = shared

@@ -156,8 +156,9 @@ class Guard:
 class EStopServer:
     """Socket of the guard: every press that has arrived is answered in the same turn, however many there are.
 
-    All presses of a turn set one flag and one latch, that of the first; its answer is sent to all. A repeated uuid gets
-    the first answer again until the e-stop is released.
+    The presses of one turn set the flag once and write one latch, which names the sender of the first press; every new
+    press of the turn gets the answer to the first. A repeated uuid gets its first answer again until the e-stop is
+    released.
 
     The data of an answer contain `carried_out_at`, the time of the press (Unix time [s]), and `latched`: "anew",
     "already" if the e-stop was latched before, or "before" if this is the answer to an earlier press.
@@ -182,7 +183,10 @@ class EStopServer:
         self._endpoints.write("guard", {"estop": self._server.endpoint})
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` [s] for a message or the bell, then answer all waiting messages."""
+        """Wait up to `timeout` [s] for a message, then answer all waiting messages.
+
+        The wait also ends when another process of the station wakes the guard.
+        """
         if not self._turns.has_waiting:
             self._poller.poll(int(timeout * 1000))
         if self._bell is not None:

@@ -63,7 +63,7 @@ def declared_delay(rate: float) -> Callable[[Any], tuple[Any, int]]:
 
 
 class _TickingClock(Clock):
-    """Clock of the station's guard: when the guard waits for control, this clock runs ticks until the time has come."""
+    """Clock of the station's guard: while the guard waits until some time, this clock runs ticks until that time."""
 
     def __init__(self, clock: Clock, tick: Callable[[], None]) -> None:
         self._clock, self._tick = clock, tick

@@ -67,8 +67,8 @@ class _Camera:
 class DropoutLog:
     """Dropouts of the cameras of one episode, updated row by row.
 
-    For each camera at most one stop and one return are reported within QUIET_S. Changes meanwhile are counted, and
-    reported with their number when that time is over, with the state at that time.
+    For each camera, at most one dropout and one return are reported within QUIET_S. Further dropouts in that time are
+    only counted. When it is over, one event reports the camera's present state and how many dropouts were counted.
     """
 
     def __init__(self, cameras: Iterable[str]) -> None:

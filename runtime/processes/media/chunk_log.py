@@ -76,8 +76,9 @@ class ChunkLog:
 def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
     """Return position errors [m], rotation errors [rad] and IK flags for each row of the policy [H, arms].
 
-    Several control steps may come from one row: its errors are the largest of theirs, and its flags are all of theirs.
-    A row without steps has NaN and no flags. For a chunk of joints all three results are None.
+    Several control steps may be computed from one row. The errors of a row are the largest errors of its steps, and its
+    flags are the union of the flags of its steps. A row without steps has NaN and no flags. For a chunk of joints all
+    three results are None.
     """
     errors, flags = (answer.position_error, answer.rotation_error), answer.ik_flags
     if errors[0] is None or errors[1] is None or flags is None:

@@ -172,9 +172,10 @@ class Media:
                 return  # later messages belong to an episode that has not begun
 
     def _ready_to_begin(self) -> bool:
-        """Begin an episode whose request waits for the previous one to be closed, if that is done or takes too long.
+        """Begin the requested episode that waits until the previous episode is closed, if there is one.
 
-        Return False if it must continue to wait.
+        It begins when the previous episode is closed, or when closing takes too long. Return False if it must continue
+        to wait, else True.
         """
         waiting = self._waiting
         if waiting is None:

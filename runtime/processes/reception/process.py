@@ -48,7 +48,10 @@ class CpuShare:
         )
 
     def exceeds_core(self, now: float, taken: float) -> bool:
-        """Return True if the last whole period used more than one core; `taken` is the time since the start [s]."""
+        """Return True if this process used more than one core during the last whole period.
+
+        `taken` is the processor time that it has used since its start [s]. Return False if no period ends at `now`.
+        """
         since = self._since or (now, taken)
         if now - since[0] < _SHARE_S:
             self._since = since
@@ -150,9 +153,9 @@ def make_source(
 ) -> Source:
     """Create the source, not yet connected: the transport's, with the deployment's own cameras added.
 
-    The transport gets a description of the robot without the cameras that the deployment opens itself, because it must
-    not wait for their pictures; cameras that it does not deliver anyway remain in the description. `build` replaces the
-    constructor of the transport's kind.
+    The transport must not wait for pictures of cameras that the deployment opens itself. It therefore gets a
+    description of the robot without these cameras; only cameras that the transport does not deliver in any case remain
+    in it. `build` replaces the constructor of the transport's kind.
     """
     settings = spec.deployment
     own = settings.cameras.keys() & set(delivered_cameras(settings, spec.robot))

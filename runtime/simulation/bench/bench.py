@@ -176,7 +176,10 @@ def overhead_camera(width: int, height: int) -> PinholeCamera:
 
 
 def wrist_camera(tip: Float64, width: int, height: int, eye: CameraPlacement | None = None) -> PinholeCamera:
-    """Return the camera at `eye` next to the fingers of an arm with fingertips at `tip` [4, 4]."""
+    """Return the camera next to the fingers of an arm with fingertips at `tip` [4, 4].
+
+    `eye` is its placement relative to the fingertips; None for the default placement.
+    """
     eye = eye or CameraPlacement()
     return _camera(tip @ _looking(eye.place, eye.aim, eye.up), _WRIST_FOCAL, width, height)
 

@@ -85,8 +85,10 @@ class Block:
         self.held_by = ""
 
     def carry(self, tip: Float64, support: float) -> None:
-        """Move the block with the fingertips at `tip`; if a support reaches `support` [m], the block is pushed up in
-        the fingers.
+        """Move the block with the fingertips at `tip` [4, 4].
+
+        If the block would then be lower than `support`, the height of the surface below it [m], it is pushed up in the
+        fingers.
         """
         self.pose = tip @ self._grip
         below = support - self.bottom

@@ -2,9 +2,9 @@
 
 The belt starts when fingertips are next to the block for the first time, so that every attempt begins from the same
 situation, however long its approach took. It then runs a motion that the seed decides and that cannot be predicted. The
-score is the share of physics steps in which fingertips are within tolerance of their place beside the block: half a
-block's edge away they point past it. A block that was pushed or picked off the belt no longer rides, and the task
-cannot be completed then.
+score is the share of physics steps in which fingertips are within tolerance of their place beside the block. The
+tolerance is half a block's edge, because from farther away the fingertips point past the block. A block that was pushed
+or picked off the belt no longer rides, and the task cannot be completed then.
 """
 
 from __future__ import annotations
@@ -97,9 +97,8 @@ class Conveyor(Tabletop):
     def truth(self) -> dict[str, object]:
         """Return the ground truth that is published with an observation.
 
-        Its entry `chase` has the time since the belt started [s], and the distances of the fingertips from the moving
-        target
-        position beside the block [mm].
+        Its entry `chase` has the time since the belt started [s], the share of steps within tolerance, and the
+        distances of the fingertips from their moving target position beside the block [mm].
         """
         distance = self.distance()
         return super().truth() | {

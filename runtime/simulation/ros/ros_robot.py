@@ -175,7 +175,8 @@ class RosRobot(ABC):
 def _split(group: Group, whole: str | None, hand: str | None) -> Iterator[JointTopic]:
     """Yield the topics of a group's joints.
 
-    `whole` is the topic of the group; with a topic `hand` for its gripper, the gripper is on that topic instead.
+    `whole` is the topic of the group, None if it has none. `hand` is the topic of its gripper; if it is None, the
+    gripper is one of the joints on the topic `whole`.
     """
     dims, joints = list(range(group.slice.start, group.slice.stop)), group.joints
     if hand and group.gripper is not None:

@@ -1,9 +1,10 @@
 """Scripted policy that picks up the block and puts it on the plate, using only its observations.
 
 It detects block and plate in the overhead image of the request, and finds its progress from the joints in it. Between
-the requests of one connection it remembers its route, its row in the route and the time. A leg ends when the joints
-have arrived, a gate when the measured jaws have moved. The row advances with the time between requests, so that a chunk
-continues the previous chunk whatever the delay.
+the requests of one connection it remembers its route, its row in the route and the time. A route consists of legs. A
+leg that moves the arm ends when the joints have arrived, a leg that opens or closes the jaws when the measured jaws
+have moved. The row advances with the time between requests, so that a chunk continues the previous chunk whatever the
+delay.
 """
 
 from __future__ import annotations
@@ -70,10 +71,10 @@ class Skill:
 
 
 class PickPlace(Script):
-    """Pick-and-place policy for all connections; its episodes are numbered across them, so that each has its own noise.
+    """Pick-and-place policy for all connections.
 
-    `apart` is the function that computes the distances of the robot's joints from rows of a route; by default the
-    largest difference of a joint.
+    Episodes are numbered over all connections, so that each has its own noise. `apart` is the function that computes
+    how far the robot's joints are from each row of a route; by default it is the largest difference of a joint.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
-"""Routes that pick and place a block with one arm: timed legs of joint targets, with gates for the jaws between them.
+"""Routes that pick and place a block with one arm: timed legs of joint targets.
 
-Between a few postures the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so that
-planning is cheap and is done once per attempt.
+A leg with a gate opens or closes the jaws, and the next leg begins only when they have moved. Between a few postures
+the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so that planning is cheap and
+is done once per attempt.
 """
 
 from __future__ import annotations
@@ -47,9 +48,11 @@ Gate = Literal["", "close", "open"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leg:
-    """Part of a route: rows float64 [n, D], one per control period; a leg with a gate ends when the jaws have moved.
+    """Part of a route: rows float64 [n, D], one per control period.
 
-    `others` are the arms that this leg moves out of the way; it is empty if the leg moves the route's own arm.
+    `gate` is "close" or "open" if the leg moves the jaws; it then ends as soon as the measured jaws have moved. `gate`
+    is "" for all other legs. `others` are the arms that this leg moves out of the way; it is empty if the leg moves the
+    route's own arm.
     """
 
     name: str

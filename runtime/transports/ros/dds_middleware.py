@@ -38,11 +38,11 @@ _POLICIES = {
 
 
 def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
-    """Return Cyclone's configuration for a network interface (name or address).
+    """Return Cyclone's configuration for a network interface (name or address); None if $CYCLONEDDS_URI is to apply.
 
-    None if $CYCLONEDDS_URI is to apply. Loopback has no multicast: participants find each other by address, at the
-    first 30 ports of the domain. This finds Fast DDS nodes, and nodes of Cyclone DDS 0.10 (Jazzy) and 11 with the same
-    configuration.
+    `peers` are addresses of participants that multicast does not reach. On loopback they are not used: because it has
+    no multicast, participants find each other by address, at the first 30 ports of the domain. This finds Fast DDS
+    nodes, and nodes of Cyclone DDS 0.10 (Jazzy) and 11 with the same configuration.
     """
     from xml.sax.saxutils import quoteattr  # imported here: it also imports HTTP and TLS
 

@@ -160,7 +160,11 @@ class TcpRosMiddleware(Middleware):
             log.exception("reading %s failed", self._topics[index][0].name)
 
     def _handle_word(self, word: dict[str, Any]) -> None:
-        """Handle a control word of the child."""
+        """Store or log what a control word of the child reports.
+
+        That is the status of its peers, a warning of rospy, a topic that it could not open, or the reason why it ends
+        and must be started again.
+        """
         if "peers" in word:
             self._take_status(word)
         elif "log" in word:

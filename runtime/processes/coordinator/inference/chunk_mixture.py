@@ -24,7 +24,11 @@ _ROUND = 0.02  # [rad] by which linearly mixed model rows may deviate in an angl
 
 
 class MixtureParts(NamedTuple):
-    """Components of N mixed rows: numbers [P, N, W], weights [P, N] that sum to 1, and the newest row [N, W]."""
+    """Components of N mixed rows, to each of which P chunks contribute.
+
+    `rows` [P, N, W] are the chunks' numbers, `weights` [P, N] sum to 1 over P, and `newest` [N, W] are the rows of the
+    newest chunk.
+    """
 
     rows: Float64
     weights: Float64
@@ -32,10 +36,11 @@ class MixtureParts(NamedTuple):
 
 
 class Mixture:
-    """Mixer of chunks' rows, in the same way as control mixes plans.
+    """Mixer of chunks' rows in the way in which control mixes plans.
 
-    `dims` names the joints that are not mixed linearly. Joints are mixed directly. Poses are computed from mixed
-    joints, because control mixes joints. Binary grippers are taken from the newest row, as received.
+    Control mixes joints, so rows of poses are computed from mixed joints. Binary grippers are not mixed but taken from
+    the newest row, as received. `dims` are the dimensions that cannot be mixed linearly: binary grippers, and angles
+    without limits.
     """
 
     def __init__(self, dims: DimensionKinds | None = None, robot: Robot | None = None) -> None:
@@ -129,7 +134,11 @@ class Mixture:
 
 
 def _mixed(parts: MixtureParts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
-    """Mix rows as the newest row plus weighted differences, so that equal rows stay equal to the last bit."""
+    """Mix rows as the newest row plus weighted differences, so that equal rows stay equal to the last bit.
+
+    The columns `switched` are copied from the newest row. In the columns `wrapping` (angles), differences are taken the
+    shorter way around.
+    """
     apart = difference(parts.rows, parts.newest, wrapping)
     mixed: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)
     mixed[:, list(switched)] = parts.newest[:, list(switched)]

@@ -55,7 +55,8 @@ class Strategy:
 class DisplayedChunk:
     """Newest chunk for pages.
 
-    `state` is "proposed", "merged" or "dropped"; `targets` are steps as in MergeResult.
+    `state` is "proposed", "merged" or "dropped". `targets` int64 [H] is the control step that each row was planned for,
+    -1 if the row was dropped.
     """
 
     number: int
@@ -143,7 +144,7 @@ class Inference:
 
     @property
     def rtc(self) -> dict[str, Any]:
-        """Status of the last conditioning for a policy that continues its chunks; {} for other strategies."""
+        """Status of the last conditioning (RTC); {} if the strategy's requests carry no committed rows."""
         if not self.continues:
             return {}
         conditioning = self._given

@@ -51,9 +51,10 @@ class PolicyMetrics:
     def add_response(
         self, seconds: float, age: float | None = None, ik: Mapping[str, Any] | None = None
     ) -> None:
-        """Add a response: latency `seconds` [s], age of its observation at the request [s].
+        """Add a response with its latency `seconds` [s].
 
-        `ik` are the figures of its poses (`requests.ik_figures`), {} for joints.
+        `age` is the age of its observation at the request [s], None if unknown. `ik` are the figures of its poses
+        (`requests.ik_figures`); {} or None for a chunk of joints.
         """
         for name, figure in (ik or {}).items():
             before = self.poses.get(name, 0)

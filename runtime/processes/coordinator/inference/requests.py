@@ -72,9 +72,9 @@ class MissBound:
 class PolicyResponse:
     """Result of a completed inference: chunk, duration [s], observation, and joint commands.
 
-    `commands` are its rows in command space, up to the first refused row, and `refused` is the reason of the refusal.
-    If `requested_while_stopped`, the robot was at rest until the response. `eef` is the origin of the observation's
-    poses: "measured" by the robot, or "fk" from its joints.
+    `commands` are the rows of `chunk`, converted to joint commands. If a row was refused, they end before it, and
+    `refused` is the reason, else "". If `requested_while_stopped`, the robot was at rest until the response. `eef` is
+    the origin of the observation's poses: "measured" by the robot, or "fk" from its joints.
     """
 
     chunk: ActionChunk
@@ -153,7 +153,8 @@ class PolicyRequests:
     def end_episode(self) -> None:
         """End the rollout on the policy's server, without waiting.
 
-        A failure is logged: the policy then ends it before its next request, or fails with the reason.
+        A failure is logged. In that case the policy ends the rollout before its next request, or fails then with the
+        reason.
         """
         policy, self._fresh = self.policy, True
 
@@ -166,7 +167,10 @@ class PolicyRequests:
         self.runner.submit(end)
 
     def push_observation(self) -> None:
-        """Call `observe` of the policy, if it needs it and it is due; stale observations are skipped."""
+        """Pass the current observation to the policy's `observe`, if the policy needs one and it is due.
+
+        Missing or stale observations are skipped.
+        """
         every, now = self.policy.observe_period_s, self._clock.now()
         if every is None or now < self._glance_at - _EARLY_S:
             return
@@ -259,8 +263,7 @@ class PolicyRequests:
         Poses before row `first` are not checked, because they will not be executed. A pose is refused if it is out of
         reach, or if the joints would lag behind it by more than a jump. A smaller lag is permitted, because the safety
         filter also limits joint rows. If `begins` and row `first` itself is refused for its lag, that row is kept, so
-        that
-        control reports the distance.
+        that control reports the distance.
 
         Raises:
             PolicyError: no row remains.

@@ -71,12 +71,15 @@ class _CommittedChunk:
 class RtcPrefix:
     """Plan from a new observation on, in the format of the newest merged chunk.
 
-    Rows are used as the policy returned them. The joint rows derived from them would not do: these are solved, snapped
-    and resampled, so the policy has never seen them. If control has blended chunks, their rows are mixed with the same
-    weights. If control fades over from a held target, or the contributions are unknown, there is no conditioning. The
-    position of a chunk on the timeline is that assigned by control: its observation step, shifted if the chunk was
-    mistimed, or the step of its arrival if the robot was waiting for it. Method: Black et al., Real-Time Execution of
-    Action Chunking Flow Policies, arXiv 2506.07339. Time is counted in steps; neither a clock nor a thread is used.
+    Rows are used as the policy returned them, and not as the joint rows derived from them, because joint rows are
+    solved, snapped and resampled, so that the policy has never returned such numbers. If control has blended chunks,
+    their rows are mixed with the same weights. If control fades over from a held target, or the contributions of the
+    chunks are unknown, there is no conditioning.
+
+    Control assigns the position of a chunk on the timeline. The chunk begins at the step of its observation, or shifted
+    from there if it was mistimed; if the robot was waiting for the chunk, it begins at the step of its arrival. Time is
+    counted in steps; neither a clock nor a thread is used. Method: Black et al., Real-Time Execution of Action Chunking
+    Flow Policies, arXiv 2506.07339.
 
     `clear` increments `generation`: a response requested in an earlier generation is ignored.
     """
@@ -107,10 +110,11 @@ class RtcPrefix:
         generation: int | None = None,
         commands: Float64 | None = None,
     ) -> None:
-        """Add a response for `observation_step`; it counts when control has merged it.
+        """Add the response to an observation of control step `observation_step`; it counts once control has merged it.
 
-        `commands` [N, D] are its joint rows at control rate; if None, its actions are joint rows already. `generation`
-        is that of the request; if None, the caller guarantees that `clear` was not called since the request.
+        `waited` is True if the robot was at rest until the response. `commands` [N, D] are the response's joint rows at
+        control rate; if None, its actions are joint rows already. `generation` is the generation in which the request
+        was sent; if None, the caller guarantees that `clear` was not called since.
         """
         if generation is None or generation == self.generation:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
@@ -152,18 +156,21 @@ class RtcPrefix:
         execution_horizon: int | None,
         observation: Observation | None = None,
     ) -> Conditioning | None:
-        """Return the conditioning of a request about `observation_step`; None if no row is left, or no chunk is merged.
+        """Return the conditioning of a request about `observation_step`; None if there is nothing to continue.
 
-        Sets `warning` if the response is expected after the last planned step; then only planned rows count as consumed
-        until it arrives. A chunk with a rate of its own has no row exactly at the observation: the remaining rows are
-        resampled.
+        That is so if no chunk is merged, none of its rows is left, the plan is unknown, or the model's rows are
+        relative.
+
+        If the response is expected after the last planned step, `warning` is set, and only planned rows count as
+        consumed until the response arrives. It is also set if the model's rows are relative. A chunk with a rate of its
+        own has no row exactly at the observation: its remaining rows are resampled.
 
         Args:
             observation_step: control step of the new observation.
             delays: recent measured delays [control steps]; if empty, the delay of the newest chunk is used.
             quantile: quantile of `delays` that is predicted, in rows, rounded up.
             execution_horizon: number of steps [control steps] of the response that will be executed; None: the whole
-                chunk. The present plan does not depend on it.
+            chunk. The present plan does not depend on it.
             observation: reference of rows that are not absolute, as for the response; required for such rows.
         """
         self.warning, self.predicted_delay = "", 0
@@ -196,10 +203,11 @@ class RtcPrefix:
     def _planned(
         self, committed: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
-        """Return the rows of `committed`, with the plan in place of its rows for `steps`; None if the plan is unknown.
+        """Return the rows of `committed`, with the planned rows in place of its own at `steps`.
 
-        `passed` is the row nearest to the first step. Rows that are not absolute are not mixed themselves: their joints
-        are mixed, and converted back to such rows.
+        None if the plan is unknown. `passed` is the row nearest to the first step. Rows that are not absolute cannot be
+        mixed themselves. Instead, their joints are mixed, and the result is converted to rows relative to
+        `observation`.
         """
         contributions = [self._contributions_at(at) for at in steps.tolist()]
         if committed.chunk.mode != "absolute":
@@ -232,8 +240,8 @@ class RtcPrefix:
     ) -> Float32 | None:
         """Return the rows of `committed`, which are not absolute, with the plan for `steps` relative to `observation`.
 
-        `contributions` are those to each step, `passed` is the row nearest to the first step. None if a contribution is
-        unknown.
+        `contributions` has for each step the weights of the chunks that contribute to it, or None if they are unknown;
+        then the result is None, too. `passed` is the row nearest to the first step.
         """
         assert observation is not None, (
             "rows that are not absolute need the observation that they are relative to"
@@ -346,7 +354,7 @@ def _repeat_last_row(rows: Float32, count: int) -> Float32:
 
 
 def _expected(delays: Sequence[int], quantile: float) -> float:
-    """Return the quantile of the delays [control steps], rounded up to a measured delay."""
+    """Return the quantile of the delays [control steps]; if it is between two measured delays, the larger one."""
     return float(np.quantile(np.asarray(delays, np.float64), quantile, method="higher"))
 
 

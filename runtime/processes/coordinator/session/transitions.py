@@ -135,8 +135,9 @@ def _placed(guard: Guard = _always) -> Guard:
 class Rule:
     """Rule of a command: the states in which it is allowed, the state after it, its effect, its guard.
 
-    `after` None does not change the state. Arguments are declared in runtime.ipc.command_arguments.ARGUMENTS.
-    `effect` raises RuntimeFault to refuse, and has then changed nothing; its return value becomes part of the answer.
+    `after` is the state after the command, or maps the state before it to the state after it; None leaves the state
+    unchanged. Arguments are declared in runtime.ipc.command_arguments.ARGUMENTS. `effect` raises RuntimeFault to
+    refuse, and has then changed nothing; its return value becomes part of the answer.
     """
 
     allowed: tuple[SessionState, ...]

@@ -139,7 +139,7 @@ class Topics:
         self._counts[index] = 0
 
     def publish(self, index: int, payload: bytes) -> None:
-        """Publish a message with the sequence number in its header that rospy would write."""
+        """Publish a message, with the next sequence number of the topic in its header, as rospy would number it."""
         self._counts[index] = (self._counts[index] + 1) % (1 << 32)
         _, message_class, publisher = self.open[index]
         message = message_class()
@@ -221,7 +221,10 @@ class PeerMonitor:
             os._exit(0)
 
     def _explain(self) -> None:
-        """Store by topic without a peer why the nodes that the master lists for it are not connected."""
+        """Find out why topics have no connected peer although the master lists nodes for them.
+
+        For each such topic the first of these nodes is examined, and the reason is stored by topic.
+        """
         lonely = [index for index in list(self._topics.open) if not self._topics.peers(index)]
         self._refused = {}
         if not lonely or self._trouble:
