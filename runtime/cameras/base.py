@@ -55,7 +55,10 @@ class CameraSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Address of a camera's pictures, in FFmpeg's terms."""
+    """Address of a camera's pictures for FFmpeg: URL, input format and options.
+
+    `shown` is the URL for display, without a password.
+    """
 
     url: str = field(repr=False)  # may hold a password
     shown: str  # for display, without a password
@@ -84,7 +87,7 @@ class CameraCondition(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth:
-    """Condition of a camera, since when on our clock [s], and why."""
+    """Condition of a camera, the time at which it began (on our clock [s]), and the reason."""
 
     condition: CameraCondition
     since: float

@@ -21,7 +21,7 @@ _JOIN_S = 0.3
 
 
 class FilePlayer:
-    """Pictures of a file, each from its due time on; the next one is decoded in advance.
+    """Player of a video file: it returns each picture from the picture's due time on, and decodes the next in advance.
 
     Before `start`, and after `reset`, the first picture is repeated at the file's own rate with new capture times.
     """

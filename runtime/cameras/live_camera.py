@@ -23,10 +23,10 @@ from runtime.core.clock import Clock, ClockMap
 
 
 class StreamTime:
-    """Map from one stream's stamps to our clock, by the smallest (arrival - stamp) over a window.
+    """Conversion of one stream's time stamps to our clock, by the smallest (arrival - stamp) of the last seconds.
 
-    A stamp that goes back begins a new map; a stamp that jumps ahead takes effect at once, because its offset is the
-    smallest. `jumps` counts both. Returned times always increase, because pictures are distinguished by them.
+    If the stream's clock jumps back or ahead, the conversion starts anew; `jumps` counts both. Returned times always
+    increase, because pictures are distinguished by them.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class StreamTime:
         self._begin()
 
     def reset(self) -> None:
-        """Begin a new map, because the stamps of a stream that was opened again start anywhere."""
+        """Start the conversion anew, because a stream that was opened again may begin with any stamp."""
         self._begin()
 
     def to_monotonic(self, stamp: float | None, arrived: float) -> float:

@@ -77,7 +77,11 @@ class SourceWithCameras(Source):
         return self._source.describe_fault(fault)
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
-        """Return the health of each camera: kind, source, condition, since when [s], why, newest picture's age [s]."""
+        """Return the health of each camera by its key: kind, source, condition, its beginning and reason, losses, age.
+
+        "since" is the time on our clock at which the condition began [s]. "age" is the age of the newest picture [s],
+        None before the first.
+        """
         return {camera.key: self._health_dict(camera) for camera in self._cameras}
 
     def pop_events(self) -> list[Event]:

@@ -31,16 +31,17 @@ class DecodedFrame:
 
 
 class Backlog:
-    """Detector of a reader that is slower than its stream, from the waiting times for packets."""
+    """Detector of a reader that is slower than its stream: it receives many packets in a row without waiting."""
 
     def __init__(self) -> None:
         self._waiting = 0  # packets in a row that arrived without waiting
 
     def should_skip(self, waited: float) -> bool:
-        """Return True if a packet that took `waited` [s] to arrive can be skipped because newer packets are queued.
+        """Return True if a packet can be skipped because newer ones are queued; the reader waited for it `waited` [s].
 
-        The first few such packets are used, because two may arrive together; so is every hundredth, so that a stream
-        that never pauses still yields pictures.
+        A packet that was available without waiting can be skipped, with two exceptions. The first two such packets in a
+        row are used, because two may arrive together. Every hundredth is used, so that a stream that never pauses still
+        yields pictures.
         """
         self._waiting = self._waiting + 1 if waited < _THERE_S else 0
         return self._waiting > _AT_ONCE and self._waiting % _SHOWN != 0
@@ -49,9 +50,9 @@ class Backlog:
 class VideoStream:
     """Stream opened with PyAV, for use by one thread. Waiting happens in FFmpeg, without the interpreter lock.
 
-    FFmpeg enforces the deadlines while it waits (PyAV's `timeout`); the time in which packets yield no picture is
-    bounded here. For JPEG pictures in multipart streams, FFmpeg only fetches the bytes. Opening raises CameraError with
-    the cause.
+    FFmpeg enforces the deadlines while it waits for data (PyAV's `timeout`). This class also raises an error if data
+    arrive but yield no picture for too long. FFmpeg only fetches the bytes of JPEG pictures in multipart streams; this
+    class separates the pictures. Opening raises CameraError with the cause.
     """
 
     def __init__(self, address: Address, open_s: float, read_s: float) -> None:

@@ -64,7 +64,7 @@ class StationClient:
         return self.query_with(kind, arguments)
 
     def query_with(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
-        """Do the same as `query`, with arguments of any name."""
+        """Send a query as `query` does; `arguments` may have any names, also those of parameters, such as "kind"."""
         return _accepted(self._send(self._send_query(kind, arguments), 2.0))
 
     def _send_query(self, kind: str, arguments: Mapping[str, Any]) -> Command:

@@ -20,7 +20,10 @@ _SCALARS = {"string": "text", "integer": "whole", "number": "number", "boolean":
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One key of a table with a single value: `type` is text, whole, number, yes or choice."""
+    """One key of a deployment's table, for a value that is no table or list.
+
+    `type` is "text", "whole" (a whole number), "number", "yes" (yes or no) or "choice".
+    """
 
     key: str
     type: str
@@ -54,9 +57,9 @@ class Entry:
 
 
 def kinds(part: str) -> dict[str, str]:
-    """Return the description of each kind of a part (a key of PACKAGES).
+    """Return by kind the description of each kind of a part; `part` is a key of PACKAGES, such as "policy".
 
-    A kind that cannot be loaded here has the reason instead.
+    If a kind cannot be loaded here, the description is the reason for that.
     """
     return {kind: _about(part, kind) for kind in variants(PACKAGES[part])}
 

@@ -58,7 +58,10 @@ def tree_of(path: Path) -> dict[str, Any]:
 def apply_assignments(
     tree: dict[str, Any], origin: dict[Key, str], source: str, assignments: Sequence[str]
 ) -> Resolved:
-    """Return the deployment in `tree`, which is modified, changed by `key=value` assignments as in `load`."""
+    """Apply `key=value` assignments to `tree` as `load` does, and return the deployment in it; `tree` is modified.
+
+    `origin` maps keys to the file or option that each came from, for errors; all other keys came from `source`.
+    """
     parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
     for key, value, option in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
         _set_key(tree, key, value, option)
@@ -108,8 +111,8 @@ def apply_changes(resolved: Resolved, changes: Mapping[str, Any], source: str) -
 def server_address(settings: Deployment) -> str:
     """Return host and port of the policy's server in a canonical spelling; "" for a policy without a server.
 
-    Two deployments on one machine use the same server if these are equal. Behind a tunnel, host and port are those at
-    the far end, followed by the tunnel's host.
+    Two deployments on one machine use the same server if this text is the same for both. Behind a tunnel, the text has
+    host and port as seen from the far end, followed by the tunnel's host.
     """
     policy = settings.policy
     url = urlsplit(str(getattr(policy, "url", "")))

@@ -61,7 +61,7 @@ class VirtualClock(Clock):
 
 
 class _StepCandidate(NamedTuple):
-    """Sequence of messages that may prove a clock step: they are equally late, and later than a message before them."""
+    """Sequence of equally late messages that follow a message that was less late: a possible clock step back."""
 
     first: float  # arrival of the first late message
     since: float  # arrival of the first of the equally late messages
@@ -71,13 +71,20 @@ class _StepCandidate(NamedTuple):
 
 
 class ClockStepDetector:
-    """Detector of steps of a peer's clock, which it distinguishes from delays, for one ordered stream.
+    """Detector of steps of a peer's clock in one ordered stream of messages; it distinguishes steps from delays.
 
-    A delay leaves stamps on the stream's period and shifts arrivals; a clock step does the opposite. A stamp more than
-    `tolerance` [s] before an earlier one is a step back at once. A smaller step back, or a stamp off the period whose
-    arrival is on the period, counts as a step when all messages of the next 0.15 s are equally late (messages in a
-    burst are not); after a gap, when the period is unknown, of the next 1 s. A message earlier than all before it is a
-    step ahead, unless its arrival is off the period. Differences within the jitter are ignored.
+    A delayed message has a stamp on the stream's period, but arrives off the period. After a clock step the stamp is
+    off the period, but the arrival is on it.
+
+    A stamp more than `tolerance` [s] before an earlier one is a step back at once. A late message is only a candidate
+    for a step back if its stamp is a little before the previous one, or is off the period while the arrival is on the
+    period. It counts as a step back once all messages of the next 0.15 s are equally late; messages in a burst after a
+    delay are not. After a gap of more than 1 s the period is unknown: every late message is a candidate, and all
+    messages of the next 1 s must be equally late.
+
+    A message with a smaller (arrival - stamp) than all before it is a step ahead, unless its arrival is off the period
+    and the difference is at most 0.5 s. In the first second of a stream only a difference of more than 0.5 s counts.
+    Differences within the jitter are ignored.
     """
 
     def __init__(self, tolerance: float = 0.5) -> None:

@@ -1,9 +1,10 @@
 """Codec of arrays in msgpack, in the dialect of openpi and our execution nodes; independent of robots.
 
 An array is a map with binary keys, in this order: `__ndarray__` true, `data` in C order, `dtype` (numpy's string),
-`shape`. A numpy scalar is a map of `__npgeneric__` true, `data` the Python number, `dtype`. Two other dialects exist
-(the package msgpack_numpy, and numpy's file format inside a map). Their decoders return arrays of another dialect as
-plain maps without an error; this one detects their marks and raises. Nothing is unpickled.
+`shape`. A numpy scalar is a map of `__npgeneric__` true, `data` the Python number, `dtype`. Two other dialects exist:
+the package msgpack_numpy, and numpy's file format inside a map. A decoder of one of them returns arrays of another
+dialect as plain maps without an error. The decoder of this module recognises the keys of both and raises an error.
+Nothing is unpickled.
 """
 
 from __future__ import annotations

@@ -64,10 +64,10 @@ class UnreadSection(BaseModel):
 
 
 class KindUnion:
-    """Type of a table of one of a package's kinds, which the table names under `kind`.
+    """Type of a deployment's table whose entry `kind` names a module of a package, for example a policy's protocol.
 
-    A kind is imported when a table names it. Tables of a package that the validation context lists under `unread` are
-    not checked: each becomes an UnreadSection.
+    The table is checked by the model of its kind, whose module is imported only then. If the validation context lists
+    the package under `unread`, its tables are not checked: each becomes an UnreadSection.
     """
 
     package: ClassVar[str]
@@ -110,7 +110,7 @@ class KindUnion:
 
 
 def kind_union(package: str) -> Any:
-    """Return the type of a table of one of the package's kinds."""
+    """Return a type for tables whose entry `kind` names a module of `package`."""
     return type("OneOf", (KindUnion,), {"package": package, "__doc__": KindUnion.__doc__})
 
 

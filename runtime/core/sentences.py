@@ -108,7 +108,7 @@ def names_of(pattern: str) -> frozenset[str]:
 
 
 def plain(text: str) -> str:
-    """Return the text as an exact str."""
+    """Return the text as an instance of `str` itself, not of a subclass such as Sentence."""
     return str.__str__(text)
 
 

@@ -35,9 +35,10 @@ def explain_validation_error(
     source: str,
     origin: Mapping[Key, str] = _NO_ORIGIN,
 ) -> str:
-    """Return one line per error in `tree`, which is to be a `root`: the key, the given value, what is allowed.
+    """Return one line per error in `tree`, a table that the model `root` does not accept.
 
-    `origin` maps keys to the files that they came from; all other keys came from `source`.
+    A line has the key, the given value and what is allowed. `origin` maps keys to the files that they came from; all
+    other keys came from `source`.
     """
     return "\n".join(_sentence(error, root, tree, source, origin) for error in invalid.errors())
 
@@ -112,7 +113,10 @@ def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[ty
 
 
 def _under(name: str, annotation: Any) -> list[Any]:
-    """Return the annotations that a value under the key `name` may have, in a value with this annotation."""
+    """Return the types that the value of the key `name` may have, in a table or list of the type `annotation`.
+
+    [] if there is no such key.
+    """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(name)
         return [field.annotation] if field else []
@@ -122,9 +126,10 @@ def _under(name: str, annotation: Any) -> list[Any]:
 
 
 def _chosen(annotation: Any, table: Any) -> list[Any]:
-    """Return the annotation in a list; for a union return that of the kind that `table` names.
+    """Return the types, out of those that `annotation` allows, that `table` may have.
 
-    [] if the table names no kind of the union.
+    If `annotation` has several kinds, only the model of the kind that `table` names is returned; [] if it names no
+    valid kind.
     """
     if isinstance(annotation, type) and issubclass(annotation, KindUnion):
         kind = table.get("kind") if isinstance(table, Mapping) else None

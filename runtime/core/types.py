@@ -56,11 +56,13 @@ class Observation:
 class ActionChunk:
     """Response of a policy: rows of actions, row 0 for the step of the observation.
 
-    `actions` is float32 [H, W] in `space`, unchanged from the server: "joint" rows are [D] in group order, "eef" rows
-    are poses in the format `pose` (None: 8 values per arm). `rate` is the rate of the rows [Hz], None: the control
-    rate. `model_actions` are the rows in the model's normalised space, if the server returned them; `model_relative` is
-    True if they are relative to the observation whatever `mode` is, None if unknown. `timing` has the server's own
-    times [ms].
+    `actions` is float32 [H, W] in `space`, in the robot's units: "joint" rows are [D] in group order, "eef" rows are
+    poses in the format `pose` (None: 8 values per arm). `rate` is the rate of the rows [Hz], None: the control rate.
+    `timing` has the server's own times [ms].
+
+    `model_actions` are the same rows in the form in which the server continues them: in the model's normalised space,
+    or before the conversion to the robot's units. None: as in `actions`. `model_relative` is True if `model_actions`
+    are relative to the observation whatever `mode` is, False if not, None if that is unknown.
 
     `mode`: "absolute" targets; "relative" to the observation that the chunk answers; "delta": each row relative to its
     predecessor, the first to the observation. Grippers are absolute in every mode. `frame` is that of relative poses:

@@ -78,7 +78,10 @@ def _later(journal: FinishedEpisode) -> list[str]:
 
 
 def without_later(features: Features, known: Collection[str]) -> Features:
-    """Return `features` without those of LATER_FLAGS that are missing in the features `known` of an older dataset."""
+    """Return `features` for a dataset that already has the features `known`.
+
+    If an older dataset lacks some of LATER_FLAGS, these are left out.
+    """
     return {
         key: feature
         for key, feature in features.items()

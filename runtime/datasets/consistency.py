@@ -374,11 +374,17 @@ def _column_statistic(
 def is_rounding_error(
     name: str, given: np.ndarray[Any, Any], value: np.ndarray[Any, Any], known: np.ndarray[Any, Any]
 ) -> bool:
-    """Return True if LeRobot's use of single precision explains the difference between two statistics.
+    """Return True if LeRobot's use of single precision explains the difference between two statistics of a column.
 
     LeRobot sums float32, with variance E[x^2] - E[x]^2. Source: the sum of n numbers in sequence has an error of at
     most n u sum|x|, u = 2^-24 (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 4.2). The variance
     has three such factors.
+
+    Args:
+        name: Name of the statistic; False for any other than "mean" and "std".
+        given: Statistic in the dataset.
+        value: Statistic computed from the rows in double precision.
+        known: Finite rows [N, ...] of the column.
     """
     share = len(known) * _ROUNDING
     if name == "mean":

@@ -121,7 +121,11 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def _identity_of_numbers(dataset: Dataset, index: int, place: int) -> str:
-    """Return the uuid that earlier versions assigned to an episode; only its columns of floats decide it."""
+    """Return the uuid that earlier versions of this program assigned to an episode.
+
+    It depends only on the values in columns of floats, the number of rows, the rate, and `place`, the episode's index
+    in the copy.
+    """
     digests = []
     table = dataset.table(index)
     for name in table.column_names:

@@ -16,7 +16,10 @@ from runtime.datasets.reader import Dataset
 
 
 class _Kind(NamedTuple):
-    """Kind of extra stream: its attributes in a mapping and in an episode, and candidate names of its column."""
+    """Kind of extra stream: the candidate names of its column, and its attributes.
+
+    `mapped` is its attribute in a ColumnMapping, `read` that in a RecordedEpisode.
+    """
 
     mapped: str
     read: str
@@ -34,7 +37,10 @@ _POSES = ("eef", "eef_action")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtraStreams:
-    """Vectors [N, W] and column name by stream, the poses' dimension names, and why other streams are left out."""
+    """Extra streams of an episode: vectors [N, W] and column name by stream, and the names of the poses' dimensions.
+
+    `left_out` has a sentence with the reason for each stream that could not be used.
+    """
 
     vectors: Mapping[str, Float32]
     columns: Mapping[str, str]
@@ -48,9 +54,10 @@ class ExtraStreams:
 
 
 def read_extra_streams(dataset: Dataset, index: int, state: str) -> ExtraStreams:
-    """Read the streams of episode `index` besides the joints in `state`.
+    """Read the streams of episode `index` besides the joints, whose column is `state`.
 
-    Velocities and efforts must be as wide as the state; poses must be named like ours. Others are left out.
+    Velocities and efforts must have as many values as the state. The dimensions of poses must have the names that our
+    recordings use, and be the same for both streams of poses. Streams that do not fit are left out.
     """
     vectors: dict[str, Float32] = {}
     columns: dict[str, str] = {}

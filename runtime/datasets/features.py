@@ -87,7 +87,7 @@ def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
 
 
 def is_depth(feature: Mapping[str, Any]) -> bool:
-    """Return True if images measure distances: LeRobot declares one channel, or `is_depth_map`."""
+    """Return True if the images measure distances, which LeRobot declares by a single channel or by `is_depth_map`."""
     info = {**(feature.get("info") or {}), **(feature.get("video_info") or {})}
     flagged = any(info.get(name) for name in ("is_depth_map", "video.is_depth_map"))
     return flagged or picture_size(feature)[2] == 1

@@ -79,10 +79,10 @@ class FinishedEpisode:
         return values
 
     def observed(self, name: str) -> tuple[Float32, NDArray[np.bool_]]:
-        """Return column `name` as float32 [N, W] with non-finite values replaced by 0, and bool [N]: which rows had
-        them.
+        """Return column `name` as float32 [N, W], and bool [N]: which rows had recorded values that are not finite.
 
-        Rows without a value are NaN and do not count as such rows.
+        In these rows the values that are not finite are replaced by 0. Rows without a recorded value are NaN and not
+        marked.
         """
         values = self.vectors(name)
         valid = np.asarray(self._column(name).is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)

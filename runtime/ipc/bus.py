@@ -252,7 +252,8 @@ class CommandClient:
     ) -> None:
         """Connect to `endpoint`.
 
-        `owner` is the station's account: answers of other accounts than that, this one and root are not trusted.
+        Commands are signed with `key`, if there is one. `owner` is the station's account: only answers of that account,
+        of this process's account and of root are trusted.
         """
         self._context = context
         self._believed = {os.geteuid(), 0, owner}

@@ -58,7 +58,7 @@ class BenchRequest(Settings):
 
 
 class LeastTimes(Settings):
-    """Minimum durations of the set-up stages that wait for the policy [s], whichever policy it is."""
+    """Minimum durations [s] of the set-up stages that wait for the policy; a faster policy waits for the rest."""
 
     connect_s: float = Field(default=0.0, ge=0, le=3600)
     warm_up_s: float = Field(default=0.0, ge=0, le=3600)
@@ -151,13 +151,19 @@ class RunRequest(Settings):
 
 
 class DiscardRequest(Settings):
-    """`discard`: mark an episode as never to be published; absent: the open one, which ends, or the newest."""
+    """Arguments of `discard`, which marks an episode as never to be published.
+
+    Without `episode` it is the open episode, which ends; if none is open, the newest one.
+    """
 
     episode: Annotated[str, Field(max_length=100)] | None = None
 
 
 class LabelRequest(Settings):
-    """`label`: outcome of an episode; without `episode`: of the open one, or the newest."""
+    """Arguments of `label`: the outcome of an episode.
+
+    Without `episode` it is the open episode; if none is open, the newest one.
+    """
 
     episode: Annotated[str, Field(max_length=100)] | None = None
     result: Result

@@ -206,8 +206,8 @@ class Endpoints:
     def write(self, process: str, endpoints: Mapping[str, str]) -> bool:
         """Write this process's endpoints, which atomically replaces those of its predecessor; return True if done.
 
-        If the disk refuses, an error is logged, and a thread retries every RETRY_S seconds until it succeeds: the
-        process does not depend on it.
+        If the file cannot be written, an error is logged, and a thread retries every RETRY_S seconds until it succeeds.
+        The process can go on meanwhile.
         """
         with self._lock:
             retried = bool(self._wanted)

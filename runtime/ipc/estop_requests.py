@@ -1,7 +1,7 @@
 """Detection of e-stop presses in messages of each wire format, tolerant of errors in the rest of a message.
 
-All entry points use this module alone. A readable message is a press if its kind is that; in an unreadable message, or
-one without a kind, a text search decides. Nothing here raises, and each message is scanned in linear time.
+All entry points use this module alone. A readable message is a press if its kind is "estop"; in an unreadable message,
+or one without a kind, a text search decides. Nothing here raises, and each message is scanned in linear time.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class FairQueue:
 
     @property
     def has_waiting(self) -> bool:
-        """True if messages are waiting, even if no further one arrives."""
+        """True if messages wait in this queue, so that a turn is due even if the socket receives no further one."""
         return bool(self._waiting)
 
     def take_turn(self) -> tuple[list[QueuedCommand], list[QueuedCommand]]:

@@ -31,6 +31,6 @@ class Membership:
     def is_needed(self, now: float) -> bool:
         """Return True while the supervisor lives or control still ticks.
 
-        For a process that control needs to its end.
+        It is for processes that control needs until control itself ends.
         """
         return not self.lifeline.is_cut or self.shared.alive("control", now, _OUTLIVES_S)

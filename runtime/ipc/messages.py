@@ -135,10 +135,10 @@ class MergeResult:
 
     `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is the
     step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
-    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for. `dropped`
-    is the reason if no row is used, else "". `contributions` [N, 3] are step, chunk id and weight for all steps to
-    which this chunk does not contribute alone; None if the merge does not support RTC (`Merge.uses_rtc`), or if there
-    are too many.
+    executed later than intended, because at most `k_max` rows may be dropped as too late; it is negative if the chunk
+    arrived before the step that it is for. `dropped` is the reason if no row is used, else "". `contributions` [N, 3]
+    are step, chunk id and weight for all steps to which this chunk does not contribute alone; None if the merge does
+    not support RTC (`Merge.uses_rtc`), or if there are too many.
     """
 
     chunk_id: int
@@ -174,7 +174,10 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class BeginEpisode:
-    """Request to open an episode and to play the source from its start; `run` 0 records all that control does."""
+    """Request to open an episode, and for a run also to play the source from its start.
+
+    `run` 0 is a recording without a run: it has all that control does.
+    """
 
     run: int
     manifest: Mapping[str, Any] | None  # None: the run is not recorded
@@ -183,12 +186,13 @@ class BeginEpisode:
 
 @dataclass(frozen=True, slots=True)
 class PolicyAnswer:
-    """Chunk as received from the policy.
+    """Chunk as received from the policy: `actions` [H, W] in `space`.
 
-    Control receives other rows, which were made from these; `source_rows` [H'] is for each row that was sent to control
-    the index of its row here. For poses, the errors float64 [H', arms] in m and rad, and the flags uint8 [H', arms]
-    (bits of kinematics.base.IkFlag), describe how well the rows sent to control reach them. `eef` is the origin of the
-    poses in the observation: "measured" or "fk".
+    Control receives other rows [H'], which were made from these, for example resampled or converted to joints.
+    `source_rows` [H'] has for each of them the index of its row in `actions`. If `actions` are poses, the errors
+    float64 [H', arms] in m and rad, and the flags uint8 [H', arms] (bits of kinematics.base.IkFlag), describe how well
+    the rows that control receives reach the poses. `eef` is the origin of the poses in the observation: "measured" or
+    "fk".
     """
 
     chunk_id: int
@@ -334,10 +338,10 @@ class ReceptionReport:
 class Command:
     """Request of a person or a program.
 
-    `boot` and `sequence` are those of the snapshot on which the decision was based; `valid_until` is in the runtime's
-    own clock, extrapolated from that snapshot. `holder` and `epoch` identify the lease. `user` and `role` are the
-    sender's claims, trusted only after runtime.ipc.identity has verified them; `vouched` names arguments that an
-    administrator wrote.
+    `boot` and `sequence` are those of the snapshot on which the sender's decision was based. The command is invalid
+    after `valid_until`, a time on the runtime's own clock, which the sender extrapolates from that snapshot. `holder`
+    and `epoch` identify the lease. `user` and `role` are the sender's claims, trusted only after runtime.ipc.identity
+    has verified them. `vouched` names the arguments whose content an administrator wrote, whoever sends the command.
     """
 
     uuid: str
@@ -418,7 +422,7 @@ _ON_THE_WIRE: dict[Any, tuple[type, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """Valid values of a field: instances of `classes` that, if `words` is not empty, are among these."""
+    """Valid values of a field: instances of one of `classes`; if `words` is not empty, only the values in `words`."""
 
     classes: tuple[type, ...]
     words: tuple[str, ...] = ()

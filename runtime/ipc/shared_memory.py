@@ -59,9 +59,9 @@ class TornReadError(RuntimeFault):
 class Record:
     """Structured record with one writer and any number of readers.
 
-    It is double-buffered, so that a preempted writer never makes it unreadable. The checksum includes the version. A
-    reader therefore notices if the content that it read belongs to another version than the version that it read,
-    because it was delayed in between or because the processor reorders memory accesses.
+    It is double-buffered, so that a preempted writer never makes it unreadable. The checksum covers content and
+    version. A reader therefore notices if the content and the version that it has read do not belong together, which
+    happens if it was delayed between the two reads or the processor has reordered them.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:

@@ -101,18 +101,18 @@ class Kinematics(Forward):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """Solve for poses [T, arms, 7]: each frame starts from its predecessor, the first from `seed` [D].
+        """Solve for the poses `targets` in sequence: each frame starts from the solution of the frame before it.
 
-        Dimensions of `seed` outside the arms' chains (grippers, head) are copied, and carriers (a torso) are assumed to
-        be as in `seed`. No joint leaves its limits. Poses that are not reached are flagged. Redundant joints are
-        resolved by the backend.
+        Dimensions of `seed` outside the arms' chains (grippers, head) are copied to every frame, and joints that carry
+        an arm (a torso) are assumed to stay as in `seed`. No joint leaves its limits. Poses that are not reached are
+        flagged. How redundant joints move depends on the backend.
 
         Args:
-            targets: Poses in each arm's declared frame.
+            targets: Poses [T, arms, 7], each in its arm's declared frame.
             seed: Joints [D] from which the first frame is solved.
             dt: Time between frames [s]; if given, no joint exceeds its velocity limit between frames.
-            anchor: Commanded position [D] in the step before row `anchor_row`; between it and that row the velocity
-            limit applies. If it is None, the first row is bound by joint limits only.
+            anchor: Joints [D] commanded for the step before row `anchor_row`; the velocity limit also applies to the
+            motion from there to that row. If it is None, the first row is bound by joint limits only.
             anchor_row: First row that will be executed; rows before it are stale, and bound by joint limits only.
         """
 

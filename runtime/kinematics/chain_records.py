@@ -23,9 +23,10 @@ POSED = 6  # degrees of freedom of a pose: joints beyond them are redundant
 def chain_type(moving: int) -> np.dtype[np.void]:
     """Return the type of a chain of up to `moving` joints; shorter chains are padded with fixed joints.
 
-    `fixed` are the transforms before each joint and after the last: a rotation row by row, then the origin [m]. Each
-    joint turns about the resulting z axis, or slides along it if `slides` is 1, by factor * q[drive] + offset; `drive`
-    is -1 for a fixed joint.
+    `fixed` has the constant transforms before each joint and after the last, each as twelve numbers: a rotation row by
+    row, then the origin [m]. The value of a joint is factor * q[drive] + offset; `drive` is -1 for a fixed joint. By
+    this value the joint turns about the z axis that results from the transform before it [rad], or slides along that
+    axis [m] if `slides` is 1.
     """
     return np.dtype(
         [
@@ -40,7 +41,10 @@ def chain_type(moving: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainSequence:
-    """Consecutive chains; `dims` are for each chain the indices of its joints in a vector."""
+    """Chains from base to tip, each on the end of the one before it.
+
+    `dims` has for each chain the indices of its joints in the vector that drives them.
+    """
 
     chains: Sequence[Chain]
     dims: Sequence[Sequence[int]]

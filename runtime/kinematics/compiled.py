@@ -164,10 +164,11 @@ class CompiledKinematics(Kinematics):
     def _replan_missed(
         self, result: IkResult, targets: Float64, seed: Float64, dt: float, reference: Float64, row: int
     ) -> None:
-        """Replan in `result` the arms that reach the first pose, but miss a later one or end near limits.
+        """Replan in `result` the arms that reach the first pose and miss a later one, or that end near limits.
 
-        Ending near a limit matters because the next chunk is unknown, and may continue towards the limit. `row` is the
-        anchor's row, -1 without an anchor, and `reference` its joints [D].
+        The first pose is that of row `row`, the anchor's row, or of row 1 if `row` is -1 because there is no anchor.
+        `reference` are the joints [D] before the anchor's row. Ending near a limit matters because the next chunk is
+        unknown, and may continue towards the limit.
         """
         begin = row if row >= 0 else 1
         if begin >= len(targets):
@@ -207,9 +208,19 @@ class CompiledKinematics(Kinematics):
         guide: Float64 | None = None,
         home_rate: float | None = None,
     ) -> IkResult:
-        """Call the kernel for some of the arms.
+        """Solve the poses `targets` [T, A, 7] of some of the arms by one call of the kernel.
 
-        Arrays must be contiguous; `anchor_row` is -1 if there is no anchor.
+        Arrays must be contiguous.
+
+        Args:
+            arms: Records of these arms [A].
+            targets: Poses, as in `solve`.
+            seed: Joints [D], as in `solve`.
+            dt: Time between frames [s]; None: no velocity limits.
+            anchor: Joints [D] before the anchor's row.
+            anchor_row: The anchor's row; -1 if there is no anchor.
+            guide: Joints [T, D] that the solution should approach; None for no guide.
+            home_rate: Rate at which redundant joints return to home [1/s]; None: that of the configuration.
         """
         costs = self._costs if home_rate is None else self._costs._replace(home_rate=home_rate)
         frames = (len(targets), len(arms))

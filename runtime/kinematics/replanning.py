@@ -51,13 +51,21 @@ def replan(
     room: LimitMargin,
     least: float = -np.inf,
 ) -> IkResult | None:
-    """Return a plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D]; None if no plan is found.
-
-    The plan reaches all poses, and its last joints [D] have a margin (`room`) above `least`.
+    """Return a plan that reaches all of `poses` [T, 1, 7] with one arm; None if no plan is found.
 
     Frames solved in sequence may follow a branch, or a posture, that cannot reach all poses. So the last pose is solved
-    from `starts` [S, n], each solution is followed back to the first pose, and the result guides a plan forwards, which
+    from several joints, each solution is followed back to the first pose, and the result guides a plan forwards, which
     approaches its guide with half of the joint velocities. The end nearest to `start` is tried first.
+
+    Args:
+        sweep: Solver of poses in sequence for this arm.
+        poses: Poses of the arm.
+        start: Joints [D] from which the plan begins.
+        dt: Time between poses [s].
+        dims: Indices of the arm's joints in the robot's vector [n].
+        starts: Joints of the arm [S, n] from which the last pose is solved.
+        room: Function that returns the margin of joints [D] to the nearest limit.
+        least: Bound that the margin of the plan's last joints must exceed.
     """
     ends = (end for end in _ends(sweep, poses[-1:], start, dims, starts) if room(end) > least)
     for end in islice(ends, _FOLLOWED):

@@ -48,7 +48,10 @@ class Allowed:
 
 
 class AllowList:
-    """Present admissions, which are replaced as a whole and read from any thread, and temporary refusals."""
+    """Admitted keys (`now`), and keys and addresses that are refused for a while.
+
+    The admissions are replaced as a whole; any thread may use them.
+    """
 
     def __init__(self, allowed: Allowed | None = None) -> None:
         self.now = allowed or Allowed()

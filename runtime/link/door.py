@@ -149,7 +149,7 @@ class Door:
     def _message(self) -> list[zmq.Frame]:
         """Return the frames of the next complete message, [] if there is none.
 
-        Of a message with too many parts, only so many are kept that it is recognised as too long.
+        Surplus parts of a message are dropped; enough are kept that the message is recognised as too long.
         """
         with suppress(zmq.Again):
             while self._room:
@@ -361,9 +361,10 @@ def _received(peer: Peer) -> int:
 
 
 def _break(connection: sockets.socket) -> None:
-    """Reset the connection; after a shutdown the queued and still arriving bytes of a flood would have to be read.
+    """Reset the connection at once.
 
-    A reset is a connect to no address, which Python does not offer (connect(2), AF_UNSPEC).
+    A mere shutdown would leave the queued and still arriving bytes of a flood to be read. Python offers no reset; it is
+    a connect to no address (connect(2), AF_UNSPEC). If that fails, the connection is shut down.
     """
     nowhere = struct.pack("=H14x", sockets.AF_UNSPEC)
     if ctypes.CDLL(None).connect(connection.fileno(), nowhere, len(nowhere)) != 0:

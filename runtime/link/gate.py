@@ -438,7 +438,7 @@ class Gate:
             self._give_up(remote, remote.held.pop(0))
 
     def _lower(self, remote: Remote, reason: str) -> None:
-        """Make the station appear as lost, and publish `reason`, why it cannot be commanded."""
+        """Make the station appear as lost; `reason`, which is published, says why it cannot be commanded."""
         if remote.told != reason and remote.mirror is not None:
             remote.mirror.lower(reason)
             self._log_once(remote, reason)

@@ -326,9 +326,9 @@ class Shelf:
         return self._arrived(begun.episode, begun.contents)
 
     def _answer_existing(self, episode: str, contents: Contents) -> Message:
-        """Return the answer to an offered episode that the lab has already: it has arrived if the contents are equal.
+        """Return the answer to the offer of an episode that the lab has already: `Arrived` if the contents are equal.
 
-        An offer with other contents is declined; nothing is overwritten.
+        Raises: _Unwanted, which declines the offer, if they differ; nothing is overwritten.
         """
         existing = contents_of(self._episodes / episode)
         if existing != contents:

@@ -1,7 +1,8 @@
-"""Mirror of a station on another computer: a folder with sockets, by which the lab's programs find it like any station.
+"""Mirror of a station on another computer: a folder with sockets, like that of a station on this computer.
 
-The e-stop socket exists as long as the station is enrolled, those for commands and streams while the link is up. While
-it is down, clients find the reason and the time of the loss instead.
+The lab's programs find and command the station by this folder. The e-stop socket exists as long as the station is
+enrolled; the sockets for commands and streams exist only while the link is up. While the link is down, clients find the
+reason and the time of the loss in the folder.
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ class Beat:
 class Ask:
     """Command for a socket of the station; the payload is the part that follows.
 
-    `challenge`, `serial` and `signature` are its token, empty if the lab has not verified a user. If `stops`, the
-    command is passed on even with an invalid token, and the station decides.
+    `challenge`, `serial` and `signature` are its token, empty if the lab has not verified a user. `stops`: the command
+    is a stop, which is passed on to the station's socket even with an invalid token.
     """
 
     number: int
@@ -281,7 +281,14 @@ def _fits(value: object, kind: Any) -> bool:
 
 
 def apart(theirs: int, version: str, station: str, lab_side: bool) -> str:
-    """Return why the release of the other end is incompatible with this one, naming both; "" if it is compatible."""
+    """Return why the release of the other end is incompatible with this one, naming both; "" if it is compatible.
+
+    Args:
+        theirs: Release number of the link at the other end.
+        version: Version of the installation at the other end.
+        station: Name of the station.
+        lab_side: Whether this end is the lab.
+    """
     if abs(theirs - RELEASE) <= 1:
         return ""
     from runtime.link.release import version as our_version

@@ -79,8 +79,8 @@ class Timeline:
     """Contiguous planned actions from step `first` on; empty if nothing is planned.
 
     The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as a fade is
-    active: a chunk merged in that time changes the plan, and the fade continues over the new plan. `laid` are the
-    placed chunks that an averaging strategy still needs. A merge discards all steps before it.
+    active. A chunk merged in that time changes the plan, and the fade continues over the new plan. `laid` are the
+    chunks on the timeline that a strategy still needs for averaging. A new plan discards all steps before its first.
     """
 
     def __init__(self, dim: int) -> None:
@@ -143,7 +143,7 @@ class Timeline:
             self.fade = None
 
     def begin_fade(self, fade: Fade) -> None:
-        """Clear the plan and start `fade`, from which alone the next plan takes over."""
+        """Discard the plan and start `fade`; the next plan is then blended with the actions in `fade` only."""
         self.clear()
         self.fade = fade
 

@@ -58,7 +58,7 @@ class Brake(Motion):
     def velocity(self, elapsed: float) -> Float64:
         """Return the velocity [D] at `elapsed` [s].
 
-        It is less than the mean velocity over a tick that ends at that time.
+        Because the joints decelerate, it is less than their mean velocity over a tick that ends at that time.
         """
         velocity = np.sign(self._velocity) * np.maximum(
             np.abs(self._velocity) - self._deceleration * elapsed, 0.0

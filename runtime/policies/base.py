@@ -61,7 +61,7 @@ class Policy(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Start a new episode; a pending reply is treated as part of the previous one."""
+        """Start a new episode; a reply that is still pending counts as one of the previous episode."""
 
     def resume(self) -> None:  # noqa: B027  # not abstract: most depend on the observation alone
         """Continue the episode after a hold during which there were no requests; called before the next `infer`."""

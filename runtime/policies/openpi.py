@@ -161,7 +161,7 @@ class OpenpiPolicy(WebsocketPolicy):
     def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
         """Return the reason to suspect that this response belongs to an earlier request, "" if there is none.
 
-        Besides the usual reasons: it arrived sooner than the inference time that it states.
+        In addition to the check of other policies: it arrived sooner than the inference time that it states allows.
         """
         with contextlib.suppress(CodecError):  # reported by `infer`
             reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)

@@ -130,10 +130,10 @@ def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> Pos
 
 
 def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:
-    """Return the declared cameras; None, for all cameras of an observation, if none are declared.
+    """Return the declared cameras; None if none are declared, which means all cameras of an observation.
 
-    All cannot be listed in advance, because a deployment may lack some cameras of the robot. Raises ConfigurationError
-    for an unknown camera.
+    These cannot be listed in advance, because a deployment may lack some cameras of the robot. Raises
+    ConfigurationError for an unknown camera.
     """
     if settings.cameras is None:
         return None

@@ -1,7 +1,7 @@
-"""Policies with the RoboArena protocol, which DreamZero, IsaacLab-Arena and vLLM-Omni use, too, over openpi's arrays.
+"""Policies with the RoboArena protocol, which DreamZero, IsaacLab-Arena and vLLM-Omni use, too; arrays as in openpi.
 
-The server's first frame states its requirements. Every request names an endpoint, infer or reset. A text frame is an
-acknowledgement only in response to a reset, and only if it is exactly "reset successful"; any other is an error.
+The server's first frame states its requirements. Every request names an endpoint, infer or reset. A text frame in
+response to a reset is an acknowledgement if it is exactly "reset successful"; every other text frame is an error.
 Source: robo-arena's policy server and clients, and the openpi endpoint of vLLM-Omni.
 """
 
@@ -94,10 +94,10 @@ class RoboarenaPolicy(WebsocketPolicy):
         self._shown.observe(observation)
 
     def reset(self) -> None:
-        """End the session on the server and wait for the acknowledgement; a session without requests is not reported to
-        it.
+        """End the session on the server and wait for the acknowledgement.
 
-        If that fails, the next `infer` tries again before its request, because the server may keep a history.
+        Nothing is sent for a session without requests. If the call fails, the next `infer` tries again before its
+        request, because the server may keep a history.
         """
         with self._lock:
             self._forget_session()

@@ -119,7 +119,10 @@ def _pose_pairs(
 
 
 def _orientation(claimed: object, own: str) -> object:
-    """Return our name for an orientation that the server names `claimed`; `own` if it is among the possible names."""
+    """Return our name for the orientation that the server calls `claimed`.
+
+    If that may be several of ours, return `own`, the deployment's, if it is one of them.
+    """
     candidates = _ORIENTATIONS.get(str(claimed).lower(), (claimed,))
     return own if own in candidates else candidates[0]
 

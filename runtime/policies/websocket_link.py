@@ -202,7 +202,8 @@ class WebsocketLink:
     def abort(self) -> None:
         """Make calls that wait in another thread raise PolicyError, now and later.
 
-        A host name that is being resolved delays that until the connect deadline.
+        A call that is resolving a host name raises the error only when the name is resolved, or at the connect
+        deadline.
         """
         self._aborted = True
         for connection in (self._shaking, self._connection):

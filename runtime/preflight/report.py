@@ -28,9 +28,9 @@ class Call:
 class Chunk:
     """Last response: `rows` of `width` values as the server sent them, at `rate` [Hz], `seconds` of motion.
 
-    Its conversion has `command_rows` rows of `joints` values at the control rate. `first_away` [rad] is the distance of
-    the first of these from the robot's pose, at the joint `first_joint`; `beyond_limits` is the number of rows that
-    leave the joint limits.
+    Converted to commands, it has `command_rows` rows of `joints` values at the control rate. `first_away` [rad] is the
+    distance of the first action from the robot's pose, found at the joint `first_joint`. `beyond_limits` is the number
+    of command rows that leave the joint limits.
     """
 
     rows: int

@@ -114,7 +114,10 @@ class PreflightRunner:
 
     @property
     def _call(self) -> str:
-        """Name of the present or last call: "connect" until the first request, "" after a response."""
+        """Name of the policy's call that has not returned, for `stage_of`.
+
+        If there is none: "connect" until the first response, "" from then on and without a policy.
+        """
         policy = self._policy
         if policy is None:
             return ""

@@ -53,7 +53,14 @@ class ImageCheck:
     def add(
         self, first: int, moving: Bools, repeated: Bools | None = None, lost: Bools | None = None
     ) -> None:
-        """Check the pictures of the next rows, from row `first` on."""
+        """Check the pictures of the next rows.
+
+        Args:
+            first: Index of the first of these rows.
+            moving: Rows in which the robot moves [N].
+            repeated: Rows that the recorder marked as having the previous picture again [N]; None: no row.
+            lost: Rows whose picture is missing in the video [N]; None: no row.
+        """
         rows = len(moving)
         nobody = np.zeros(rows, np.bool_)
         repeated, lost = nobody if repeated is None else repeated, nobody if lost is None else lost
@@ -164,8 +171,8 @@ class _RepeatCheck:
     """Check for repeated pictures: marked by the recorder, or detected while the robot moves.
 
     An unchanged picture proves nothing while the robot is at rest. A key frame after other frames differs from them
-    even if the scene is unchanged: it neither begins nor ends a run. A `drawn` picture is unchanged whenever nothing
-    moves in its view, so it is not checked.
+    even if the scene is unchanged, so it does not end a run of unchanged pictures. A `drawn` (simulated) picture is
+    unchanged whenever nothing moves in its view, so it is not checked.
     """
 
     def __init__(
@@ -193,7 +200,17 @@ class _RepeatCheck:
         repeated: Bools,
         lost: Bools,
     ) -> None:
-        """Check rows; `dull` pictures (black or uniform) and repeats for `lost` pictures are reported elsewhere."""
+        """Check the next rows [N], from row `first` on.
+
+        Args:
+            first: Index of the first of these rows.
+            change: Difference of each picture from the one before it.
+            keys: Which pictures are key frames.
+            dull: Which pictures are black or uniform; these are reported elsewhere.
+            moving: Rows in which the robot moves.
+            repeated: Rows that the recorder marked as having the previous picture again.
+            lost: Rows whose picture is missing in the video; these are reported elsewhere.
+        """
         marked = repeated | lost
         self._count("repeated", first, repeated & ~lost)
         self._said.add(first, repeated & ~lost)

@@ -38,7 +38,8 @@ def check_dataset_episode(
 ) -> Report:
     """Check episode `index` of a LeRobot dataset and return the report.
 
-    Raises RecordingError if the dataset has no such episode.
+    `state` names the column of measured joints, "" for the usual columns. `robot` is the robot that has these joints in
+    this order; "" if only the dataset describes them. Raises RecordingError if the dataset has no such episode.
     """
     opened = open_dataset(dataset) if isinstance(dataset, Path) else dataset
     return run_checks(DatasetSource(opened, index, state, robot), settings or QualitySettings())

@@ -32,7 +32,10 @@ _LOOK_S = 0.1
 
 
 class CommandExecutor:
-    """Only path from the channel to the coordinator, except for stops. One thread uses it."""
+    """Executor of the scripts' messages: every command except a stop reaches the coordinator through it.
+
+    One thread uses it.
+    """
 
     def __init__(
         self,

@@ -11,10 +11,10 @@ _CONNECTIONS = 1000  # connections remembered
 
 
 class HolderNames:
-    """Assignment of messages to holders: a script that names itself, a connection, or all scripts together.
+    """Assignment of messages to lease holders: a script that names itself, a connection, or all scripts together.
 
-    `user` is the account of the channel's process, from the deployment. A name that a script gives itself is appended
-    to it, and is not verified.
+    `user` is the name of the channel itself, with its operator. A holder's name is `user`, followed by the name that
+    the script gives itself, which is not verified.
     """
 
     def __init__(self, operator: str, scripts: Literal["apart", "together"]) -> None:
@@ -26,7 +26,8 @@ class HolderNames:
     def holder(self, connection: bytes, client: str) -> str:
         """Return the name of the lease's holder for a message on `connection`; `client` is the script's own name.
 
-        A script can only choose a name below the channel's own.
+        The script's own name is only appended to the channel's, so that it can never be that of a holder outside the
+        channel.
         """
         if client:
             return f"{self.user}/{client}"
@@ -40,11 +41,11 @@ class HolderNames:
     def is_alive(self, connection: bytes, message: Message, stops: bool) -> bool:
         """Return True if the message shows that its holder is alive; `stops`: the message is a stop.
 
-        A script that has a name or a connection of its own is alive with every message. If all scripts are one holder,
-        a script that only asks for the status must not extend the lease of a script that commands. A query then counts
-        only if its connection has sent a command before, if it asks for the result of a command, or if it asks for the
-        status as the first message of its connection: clients that reconnect for each call wait for the end of a
-        command in this way.
+        Every message of a script with a name or a connection of its own shows that. If all scripts together are one
+        holder, a script that only asks for the status must not extend the lease of a script that commands. Then every
+        command counts, but a query only in three cases: its connection has sent a command before; it asks for the
+        result of a command; or it asks for the status as the first message of its connection. The last case is that of
+        clients that reconnect for each call while they wait for the end of a command.
         """
         if self._apart or message.client:
             return True

@@ -46,9 +46,9 @@ class Message:
 
 
 def read(frames: list[bytes]) -> Message:
-    """Parse the frames behind the address.
+    """Parse a message from its frames, without the sender's address.
 
-    Raises: Malformed, but never for a press of the e-stop.
+    Raises: Malformed if the message is invalid. A press of the e-stop is always accepted, whatever else is invalid.
     """
     for frame in frames:
         if (press := pressing.parse_json_press(frame, "command", "cmd")) is not None:

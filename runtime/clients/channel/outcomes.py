@@ -132,6 +132,6 @@ class Outcomes:
 
     @property
     def pending(self) -> list[Outcome]:
-        """Outcomes of commands that continue."""
+        """Outcomes of commands that were accepted and are not over yet."""
         with self._lock:
             return [outcome for outcome in self._kept.values() if outcome.result == "accepted"]

@@ -1,4 +1,7 @@
-"""Status in the older channel's form, from a station's snapshot; keys without a counterpart are null, false, empty."""
+"""Status in the older channel's form, from a station's snapshot.
+
+A key of the older channel without a counterpart is null, false or empty.
+"""
 
 from __future__ import annotations
 

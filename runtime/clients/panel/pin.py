@@ -77,9 +77,9 @@ class _Failures:
     last: float = 0.0
 
     def add(self, now: float, free: int, longest: float) -> None:
-        """Count a failure: the first `free` failures cost nothing.
+        """Count a failure; from the failure with number `free` on, each causes a wait before the next attempt.
 
-        From then on the wait doubles with each failure, up to `longest` [s].
+        The wait is 2 s after that failure and doubles with each further one, up to `longest` [s].
         """
         self.count, self.last = self.count + 1, now
         beyond = self.count - free

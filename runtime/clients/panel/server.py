@@ -41,7 +41,8 @@ class Connection:
     def cut(self) -> None:
         """Shut the connection down; its thread then closes it.
 
-        Uses the plain socket's shutdown, because its thread may be inside that of SSLSocket.
+        The shutdown of the plain socket is called, because the connection's thread may be executing a method of the TLS
+        socket.
         """
         self.gone = True
         with suppress(OSError):

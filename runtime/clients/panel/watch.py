@@ -188,9 +188,9 @@ def _reason(snapshot: Mapping[str, Any]) -> str:
 
 
 def _open(sentence: Any) -> bool:
-    """Return True if the panel may display a sentence.
+    """Return True if the panel may display a sentence, because it reveals nothing of a policy that a blind plan hides.
 
-    The kinds of the sentence and of all sentences in its arguments must be permitted.
+    The ids of the sentence and of all sentences in its arguments must begin with a permitted group.
     """
     if not isinstance(sentence, Mapping) or str(sentence.get("id")).split(".")[0] not in _SHOWN:
         return False

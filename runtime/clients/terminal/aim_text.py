@@ -57,7 +57,7 @@ def aim_lines(
         aim: Answer of the station.
         commanded: Commanded joints [D].
         names: Names of the joints [D].
-        speed: Share of the speed of such motions, up to 1.
+        speed: Speed of the motion as a share of the speed that the answer assumes, at most 1.
     """
     lines = [
         f"  {name:<24} {now:+.4f} -> {then:+.4f}"

@@ -13,7 +13,7 @@ from types import TracebackType
 
 
 class Keys(ABC):
-    """Source of single keys, which waits for them. It is a context manager, which restores the terminal."""
+    """Source of single key presses; as a context manager it restores the terminal at the end."""
 
     @abstractmethod
     def key(self, seconds: float) -> str:

@@ -86,7 +86,7 @@ def _lease(lease: Mapping[str, Any], me: str) -> str:
 
 
 def drive_line(said: Mapping[str, Any]) -> str:
-    """Return the state of the drives as the node reports it."""
+    """Return a line about the state of the drives as the execution node reports it; `said` is empty if it does not."""
     if not said:
         return "not reported by the node"
     faults = "".join(f"; fault: {fault}" for fault in said["faults"])
@@ -121,7 +121,12 @@ def _mode(status: Mapping[str, Any]) -> str:
 
 
 def distance_text(found: Mapping[str, Any], what: str) -> str:
-    """Return a text about the robot's distance `found` from the action `what`; "" if there is no action."""
+    """Return a text about how far the robot is from an action; "" if `found` is empty, because there is no action.
+
+    Args:
+        found: Entry of the status with the distance, the joint, and whether that is too far.
+        what: Name of the action in the text.
+    """
     if not found:
         return ""
     far = ": FAR, approach it first" if found["far"] else ""

@@ -175,7 +175,10 @@ def _waits(line: argparse.ArgumentParser) -> None:
 
 
 def _target(line: argparse.ArgumentParser, *more: str) -> Any:
-    """Add the exclusive options that name a target; return their group, to which the caller may add options."""
+    """Add the mutually exclusive options that name a target, and return their group.
+
+    The caller may add further options to the group.
+    """
     group = line.add_mutually_exclusive_group(required=True)
     group.add_argument("--pose", metavar="NAME", help="a pose of the robot")
     group.add_argument(

@@ -70,6 +70,6 @@ def wait_until_settled(
 def is_busy(status: dict[str, Any]) -> bool:
     """Return True if a run is in an active phase or a motion is in progress.
 
-    The motion of a gripper needs no open run.
+    The motion counts separately, because a gripper can move without an open run.
     """
     return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

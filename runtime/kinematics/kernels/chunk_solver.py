@@ -39,10 +39,11 @@ _SHORTEST = 1e-12  # square of the shortest valid quaternion
 def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
     """Return the type of an arm's record.
 
-    The arm has a chain of `moving` joints that `size` driving numbers move, on a carrier of `carrying` joints. The
-    first `joints` of the driving numbers are the arm's own: `dims` are their indices in the robot's vector, `lower` and
-    `upper` their limits, `speed` their velocity limits; all further numbers are padding and 0. A limit repels a joint
-    that is nearer to it than `below` (for `lower`) or `above` (for `upper`).
+    `own` is the chain of the arm's own joints, padded to `moving` joints, and `carrier` the chain that carries it,
+    padded to `carrying` joints. The arrays from `dims` on have one entry per driving number of `own`, padded with 0 to
+    `size`; `joints` is the number of entries without the padding. `dims` are the indices of the driving numbers in the
+    robot's vector, `lower` and `upper` their limits, `speed` their velocity limits, `home` their values at home. A
+    limit repels a joint that is nearer to it than `below` (for `lower`) or `above` (for `upper`).
     """
     return np.dtype(
         [
@@ -90,11 +91,23 @@ def solve_chunk(
     rotation_error: Float64,
     flags: UInt8,
 ) -> int:
-    """Compute joints q [T, D], errors and flags [T, A] for targets [T, A, 7], from seed [1, D].
+    """Compute joints, errors and flags for a chunk of poses; return FINE, NOT_FINITE or NO_QUATERNION.
 
-    `dt` [s] is 0 if there is no velocity limit; `anchor` [D] is ignored if `anchor_row` is -1; `guide` [T, D] are
-    joints that rows should approach, or [0, D]; `scratches` needs one element. Returns FINE, NOT_FINITE or
-    NO_QUATERNION.
+    Args:
+        arms: Records of the arms [A].
+        costs: Weights of the solution.
+        tolerances: Errors within which a frame is reached, and the bound for singularities.
+        targets: Poses [T, A, 7].
+        seed: Joints [1, D] from which the first frame is solved.
+        dt: Time between frames [s]; 0 if there is no velocity limit.
+        anchor: Joints [D] before row `anchor_row`.
+        anchor_row: First row for which the velocity limit applies; -1: no anchor, the limit applies from row 1 on.
+        guide: Joints [T, D] that the rows should approach; [0, D] if there is no guide.
+        scratches: Scratch memory, one element.
+        q: Receives the joints [T, D].
+        position_error: Receives the position errors [T, A] in m.
+        rotation_error: Receives the rotation errors [T, A] in rad.
+        flags: Receives the flags [T, A].
     """
     wrong = _wrong(targets, seed, anchor)
     if wrong != FINE:

@@ -134,8 +134,10 @@ def _evaluate(costs: Costs, frame: Record) -> float:
 
 @device_function
 def _set_quadratic(rest: float, frame: Record) -> None:
-    """Set the system and the gradient of the quadratic problem, half the cost around frame.q, and the bounds of the
-    step.
+    """Set the quadratic problem for the next step from frame.q: gradient and system of half the cost, and the box.
+
+    `rest` is the weight of the distance from the rest position. The box is the range of steps that stay within the
+    bounds.
     """
     box, jacobian = frame.box, frame.jacobian
     for i in range(len(frame.q)):

@@ -13,11 +13,11 @@ from runtime.kinematics.kernels.rotations import compute_sincos
 
 
 class LinkTable(NamedTuple):
-    """Table of links [P], parents first, with the pose of each relative to its parent as a function of its joint value.
+    """Table of links [P], parents first; a link's pose relative to its parent is a function of one joint value.
 
-    `motions` [P, 4, 12] are weighted by 1, the cosine, the sine and the value itself, and added; the sum is a rotation
-    row by row, then the origin. The value is factor * q[drive] + offset (drive -1: the offset) within `low` and `high`;
-    `above` is the parent's index.
+    The value v is factor * q[drive] + offset, limited to `low` and `high`; it is the offset if `drive` is -1. The pose
+    is motions[0] + cos(v) motions[1] + sin(v) motions[2] + v motions[3] with the link's `motions` [4, 12]: a rotation
+    row by row, then the origin. `above` is the parent's index, negative for a link without a parent.
     """
 
     motions: Float64

@@ -1,7 +1,8 @@
-"""Assignment of cameras to the slots of a RoboArena request, which the deployment declares; their order has no meaning.
+"""Assignment of cameras to the slots of a RoboArena request, as the deployment declares it.
 
-Servers and most clients number the exterior cameras from 0, the original client from 1. A server that receives the
-other numbering uses a picture for the wrong view, or drops it, without an error.
+It is declared because the order of a robot's cameras does not tell their slots. Servers and most clients number the
+exterior cameras from 0, the original client from 1. A server that receives the other numbering uses a picture for the
+wrong view, or drops it, without an error.
 """
 
 from __future__ import annotations

@@ -44,11 +44,11 @@ class Modality:
 
 @dataclass(frozen=True, slots=True)
 class Modalities:
-    """Modalities of a server.
+    """Modalities of a server: the keys of its model's inputs and outputs.
 
-    `is_n15` is True for version N1.5. `reads_mnp` is True if the server reads arrays like N1.7, None if its response
-    does not show the version. `contract` is the response of a server that uses this protocol without modality
-    configurations.
+    `is_n15` is True for version N1.5. `reads_mnp` is True if the server reads the array format MNP, as N1.7 does, None
+    if its response does not show the version. `contract` is the whole response of a server that uses this protocol
+    without modality configurations (StarVLA), None for other servers.
     """
 
     video: Modality

@@ -21,8 +21,8 @@ class AsyncRtc(Dialect):
     """Dialect with one request at a time, whose number the response must repeat.
 
     The part `rtc` of a request contains the rest of the previous chunk, the predicted delay, and `execution_horizon`.
-    In this dialect that is the end of the transition from those rows to new rows: never below the delay, never above
-    the model's horizon.
+    In this dialect `execution_horizon` is the row at which the transition from the previous chunk to new rows ends:
+    never below the delay, never above the model's horizon.
     """
 
     def __init__(self, schedule: Schedule, max_guidance_weight: float) -> None:

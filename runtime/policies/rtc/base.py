@@ -16,8 +16,8 @@ class Dialect(ABC):
     """Dialect of RTC messages: wraps requests and unwraps replies. Each policy has its own instance, for one thread.
 
     There is no common standard. A dialect raises an error if the metadata show that the server uses another one.
-    `continues_model_rows` is True if chunks are sent back in the model's own space, provided that the server returned
-    them in it.
+    `continues_model_rows` is True if the previous chunk is sent back in the model's own space whenever the server has
+    returned it in that space.
     """
 
     continues_model_rows = True

@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Request SIGTERM for the time when the parent dies, and replace this process by the program. Never returns."""
+    """Let the kernel end this process when its parent ends (SIGTERM), and replace it by the program. Never returns."""
     parent, program = int(sys.argv[1]), sys.argv[2:]
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0):

@@ -69,7 +69,8 @@ def free_port() -> int:
 class Ssh:
     """ssh process in a session of its own, which ends with the thread that started it and with this process.
 
-    With `echoes` the remote command echoes its input as soon as it runs; until then the local port is not usable.
+    With `echoes` it runs a remote command that echoes its input; the local port counts as usable only after the first
+    echo.
     """
 
     def __init__(self, command: Sequence[str], port: int, echoes: bool = False) -> None:
