@@ -24,7 +24,11 @@ class EpisodeStatus(models.TextChoices):
 
 
 class EpisodeMode(models.TextChoices):
-    """Source of the motion in a recording: a mode of a run, "observe" outside a run, or "collect"."""
+    """Way in which the robot was moved while an episode was recorded.
+
+    Runs have the modes from "continuous" to "manual". "observe" is a recording without a run, "collect" a
+    demonstration.
+    """
 
     CONTINUOUS = "continuous", "continuous"
     STEP = "step", "step by step"

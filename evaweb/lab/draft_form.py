@@ -19,7 +19,7 @@ _TITLES = {"transport": "Way to the robot", "policy": "Policy server"}
 
 @dataclass(frozen=True, slots=True)
 class Typed:
-    """Key of a table with the value in its field."""
+    """Field of the form: a key of the deployment, and the text in its field."""
 
     name: str
     entry: Entry
@@ -30,7 +30,7 @@ class Typed:
 class Part:
     """Table of the deployment: its kind, the available kinds with descriptions, and its keys.
 
-    `hidden` are keys without a field, with the values that were sent for them anyway.
+    `hidden` are keys for which the form has no field, with the values that were sent for them anyway.
     """
 
     place: str
@@ -42,12 +42,12 @@ class Part:
 
     @property
     def asked(self) -> list[Typed]:
-        """Keys whose values are addresses."""
+        """Keys whose values are network addresses; the form asks for them first."""
         return [key for key in self.keys if key.entry.address]
 
     @property
     def further(self) -> list[Typed]:
-        """Keys whose values are not addresses."""
+        """Keys whose values are not network addresses."""
         return [key for key in self.keys if not key.entry.address]
 
 

@@ -1,8 +1,8 @@
 """Least durations of a blind trial's set-up stages, so that timing does not reveal its checkpoint.
 
-The stages that wait for the policy are extended to the longest recent duration among the plan's checkpoints at this
-station, plus up to a quarter of it, drawn from the plan's key. Without this addition a stage that exceeds its least
-duration would show that the checkpoint is the slowest one.
+A stage that waits for the policy lasts at least as long as the longest that it recently took with any checkpoint of
+the plan at this station, plus a random time of up to a quarter of that, drawn from the plan's key. Without the
+random time, a stage that takes longer than its least duration would reveal the slowest checkpoint.
 """
 
 from __future__ import annotations

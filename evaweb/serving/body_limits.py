@@ -1,4 +1,4 @@
-"""Limits of REST request bodies by path: role, bytes and number of values, in one table."""
+"""Limits of REST request bodies by path, in one table: who may send how many bytes and values."""
 
 from __future__ import annotations
 

@@ -141,11 +141,16 @@ def design(
     counts: Sequence[tuple[int, int]] | None = None,
     holm: bool = False,
 ) -> Design:
-    """Return a design and compute its boundary; `looks` are numbers of blocks, empty for a look after every block.
+    """Return a design and compute its boundary.
+
+    `looks` are the numbers of blocks after which the data are looked at; if empty, they are looked at after every
+    block.
 
     Raises:
-        StatisticsError: If the combination is not allowed: a margin or looks with a rule that has none, an exact
-            boundary with more than 250 trials per arm, scores or an e-process with arms in random order.
+        StatisticsError: The combination is not allowed: a margin with a rule that allows no margin, looks with a rule
+        that
+            allows no looks, an exact boundary with more than 250 trials per arm, or arms in random order with scores or
+            an e-process.
     """
     check_design(
         rule=rule,

@@ -172,7 +172,10 @@ def _reset_to_prepared(trial: Trial, reason: str) -> None:
 
 
 def _runtime_restarted(trial: Trial) -> Trial:
-    """End the trial of an earlier boot; its events are lost, so its recording decides how."""
+    """End a trial during which the station was restarted.
+
+    The events of that run are lost, so the trial's recording decides whether the trial ended or was interrupted.
+    """
     episode = trial.episode
     if episode is not None and episode.status == EpisodeStatus.FINISHED and episode.frames:
         _apply_transition(trial, Transition.END, episode.reason or "ended while the web was away", None)

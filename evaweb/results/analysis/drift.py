@@ -65,7 +65,10 @@ def _earlier(plan: Plan, row: dict[str, Any]) -> list[Plan]:
 
 
 def _served(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
-    """Return the properties of an anchor on which its outcomes depend; labels are excluded."""
+    """Return the properties of an anchor, a checkpoint that several plans share, on which its outcomes depend.
+
+    Labels are excluded.
+    """
     fields = {name: row.get(name) for name in ("name", "policy", "digest", "strategy")}
     document = plan.document or {}
     return {**fields, "of_plan": document.get("strategy"), "counts_as": document.get("counts_as")}

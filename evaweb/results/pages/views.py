@@ -92,7 +92,10 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render the evidence so far, for users who may see it; with HX-Request only the meter as a fragment."""
+    """Render the page of the evidence so far, for users who may see it.
+
+    A request by htmx (header HX-Request) gets only the part of the page that it refreshes.
+    """
     plan = _get_plan(name, version)
     sealed = _sealed_page(request, plan)
     if sealed:

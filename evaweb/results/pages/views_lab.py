@@ -25,7 +25,10 @@ RECENT = 12
 
 @require_GET
 def dashboard(request: HttpRequest) -> HttpResponse:
-    """Render running evaluations, stations and recent trials; with HX-Request only that fragment."""
+    """Render running evaluations, stations and recent trials.
+
+    A request by htmx (header HX-Request) gets only the part of the page that it refreshes.
+    """
     fragment = bool(request.headers.get("HX-Request"))
     return render(request, "results/lab_body.html" if fragment else "results/lab.html", _lab(request))
 

@@ -82,7 +82,7 @@ class Headline:
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """Alternative headlines, one sentence each, without corrections after the reveal."""
+        """Reservations about the headline, one text each; they leave out corrections that were made after the reveal."""
         caveats = [*self.estimates]
         if self.at_first:
             caveats.append(

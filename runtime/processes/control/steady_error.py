@@ -63,7 +63,9 @@ class SteadyError:
             self.last = np.where(standing, error, self.last)
 
     def leave_out(self) -> None:
-        """Discard samples while the command is moved to the reading: they do not show how joints follow."""
+        """Discard samples while the command is being moved to the measured position: they do not show how joints
+        follow.
+        """
         self._samples.clear()
         self._presses[:] = False
 

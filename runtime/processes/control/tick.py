@@ -479,8 +479,9 @@ class Tick:
     def _disengage(self, reason: str) -> None:
         """Stop sending commands, and emit `reason`.
 
-        Holding is not possible here: if a node restarted with joints at 0, the old target would pull the robot, and if
-        an encoder died, a target from its reading would.
+        The robot cannot be told to hold here. If its node restarted with all joints at 0, the old target would pull the
+        robot
+        away; if an encoder died, a target made from that encoder's reading would do so.
         """
         self._left_run = self._report.run
         self._report_displaced(reason)

@@ -15,7 +15,7 @@ from runtime.core.types import Float64, UInt8
 if TYPE_CHECKING:
     from robots import Robot
 
-_BITS = 24  # of the frame number, lowest first
+BITS = 24  # of the frame number, lowest first
 _STRIP = 1 / 30  # share of the image height
 _BLUE, _GREEN, _RED = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 _BLOCKS = ((60, 60, 235), (60, 200, 60), (220, 140, 40), (40, 200, 230))  # BGR, one per group in turn
@@ -63,15 +63,15 @@ def frame_number(picture: UInt8) -> int:
     """Return the number in the top strip of an image of any size and colour order."""
     height, width = picture.shape[:2]
     row = max(0, int(height * _STRIP / 2))
-    columns = ((np.arange(_BITS) + 0.5) * width / _BITS).astype(int)
+    columns = ((np.arange(BITS) + 0.5) * width / BITS).astype(int)
     bits = picture[row, columns].mean(axis=-1) > 127
-    return int(bits @ (1 << np.arange(_BITS)))
+    return int(bits @ (1 << np.arange(BITS)))
 
 
 def _write_number(picture: UInt8, number: int) -> None:
     height, width = picture.shape[:2]
-    bits = (number >> np.arange(_BITS)) & 1
-    cells = (np.arange(width) * _BITS) // width
+    bits = (number >> np.arange(BITS)) & 1
+    cells = (np.arange(width) * BITS) // width
     picture[: int(height * _STRIP)] = (255 * bits[cells])[:, None].astype(np.uint8)
 
 

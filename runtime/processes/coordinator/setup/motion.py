@@ -85,7 +85,7 @@ class SetupMotion:
         return False
 
     def _motion_time(self) -> float:
-        """Return the duration of the motion from its start [s]."""
+        """Return how long the whole motion takes, from its start position to the goal [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale
         acceleration = safety.motion_acceleration * limits.radian_scale
