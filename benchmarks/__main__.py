@@ -14,6 +14,7 @@ _BENCHMARKS = (
     "coverage",
     "designs",
     "estop",
+    "glass",
     "ik",
     "lab",
     "latency",
@@ -33,7 +34,7 @@ _BENCHMARKS = (
 )
 _SETTABLE = ("latency", "loop")
 _SEEDED = ("chaos",)
-_LONG = ("designs", "recording", "results")
+_LONG = ("chaos", "designs", "recording", "results")
 _SECONDS = 20.0
 
 

@@ -41,6 +41,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ready_file", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    parser.add_argument(
+        "--numbered", action="store_true", help="pictures with their numbers instead of a table"
+    )
     options = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
@@ -63,7 +66,10 @@ def _up(lab: Any, options: argparse.Namespace) -> None:
     from evaweb.lab.processes import ProgramSpec
     from runtime.simulation.program import announce_ready
 
-    node = lab.processes.start(programs.tabletop(ROBOT, programs.bench(1, 640, 480)))
+    bench = programs.bench(1, 640, 480)
+    if options.numbered:
+        bench += ("--bench", "none")
+    node = lab.processes.start(programs.tabletop(ROBOT, bench))
     serving = ("-m", "runtime.standins.serve", "openpi", *_POLICY)
     policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
     assignments = [

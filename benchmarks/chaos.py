@@ -5,6 +5,8 @@ drawn from the seed, a process of the lab or the station is killed (SIGKILL), or
 (SIGSTOP), as if it were cut. The supervisors of lab and station, which restart the other processes, are never killed,
 nor are the simulated robot and the policy. A station whose processes end six times within a minute ends for good, so at
 most four are killed per minute.
+
+With `--long`, the lab has its own PostgreSQL and Redis servers, which are crashed and started again like the rest.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +35,7 @@ from benchmarks.estop_lab import PRESSED
 from benchmarks.lab import enrol, two_free_ports
 from benchmarks.labs import RunningLab, lab
 from benchmarks.report import Figure, Report
+from benchmarks.servers import postgresql, redis, why_no_postgresql, why_no_redis
 from benchmarks.start import started
 from evaweb.lab.rest_client import RestClient
 from evaweb.lab.stall_detection import DemoFailed, NoReply
@@ -252,15 +256,24 @@ def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
     return by_name
 
 
-def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Random) -> Counter[str]:
-    """Kill and pause processes for `seconds`; return how often, by name."""
+def _hurt(
+    parents: tuple[psutil.Process, ...],
+    crashes: Mapping[str, Callable[[], None]],
+    seconds: float,
+    chance: random.Random,
+) -> Counter[str]:
+    """Kill and pause processes for `seconds`, and crash the servers in `crashes`; return how often, by name."""
     counts: Counter[str] = Counter()
     of_station: list[float] = []
     until = time.monotonic() + seconds
     while (now := time.monotonic()) < until:
         time.sleep(min(chance.uniform(*_PAUSE_S), until - now))
         of_station = [at for at in of_station if at > time.monotonic() - 60.0]
-        name = chance.choice((*_OF_LAB, *_OF_STATION, "link stopped"))
+        name = chance.choice((*_OF_LAB, *_OF_STATION, "link stopped", *crashes))
+        if name in crashes:
+            crashes[name]()
+            counts[name] += 1
+            continue
         process = _ours(*parents).get(name.split()[0])
         if process is None or (name in _OF_STATION and len(of_station) >= _MOST_OF_STATION):
             continue
@@ -278,15 +291,26 @@ def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Ra
     return counts
 
 
-def measure(seconds: float, seed: int | None = None) -> Report:
-    """Kill processes for `seconds`, then measure what was lost.
+def _servers(folder: Path, stack: ExitStack) -> dict[str, Callable[[], None]]:
+    """Start PostgreSQL and Redis for this process and its children; return how to crash each."""
+    if missing := why_no_postgresql() or why_no_redis():
+        raise SystemExit(f"chaos --long needs PostgreSQL and Redis: {missing}")
+    store = stack.enter_context(postgresql(folder / "postgresql"))
+    broker = stack.enter_context(redis(folder / "redis"))
+    os.environ.update(DATABASE_URL=store.url, REDIS_URL=broker.url)
+    return {"postgresql": store.crash, "redis": broker.crash}
+
+
+def measure(seconds: float, seed: int | None = None, *, long: bool = False) -> Report:
+    """Kill processes for `seconds`, with `long` also PostgreSQL and Redis, then measure what was lost.
 
     The figures are `lost_episodes`, `lost_scores`, `lost_trials`, `doubled`, `stuck_trials` and `lost_after_delete`.
     """
     seed = secrets.randbelow(2**31) if seed is None else seed
     chance = random.Random(seed)
-    with tempfile.TemporaryDirectory(prefix="chaos") as name:
+    with tempfile.TemporaryDirectory(prefix="chaos") as name, ExitStack() as stack:
         folder = Path(name)
+        crashes = _servers(folder, stack) if long else {}
         robot = folder / PRESSED
         robot.mkdir()
         extra = {"EVA_GATE": f"127.0.0.1:{two_free_ports()}", "EVA_GATE_NAME": "127.0.0.1"}
@@ -308,7 +332,7 @@ def measure(seconds: float, seed: int | None = None) -> Report:
                     operator = _Operator(running, random.Random(seed + 1))
                     operator.start()
                     parents = (running.process, station.processes["supervisor"])
-                    hurt = _hurt(parents, seconds, chance)
+                    hurt = _hurt(parents, crashes, seconds, chance)
                     operator.over.set()
                     operator.join()
                     state = _at_rest(operator, robot, folder / "data")
@@ -322,7 +346,7 @@ def measure(seconds: float, seed: int | None = None) -> Report:
     figures += [Figure("never_begun", float(len(state.unopened)), "")]
     figures += [Figure("removed_at_home", float(len(state.folders - state.at_home)), "")]
     figures += [Figure("voided_at_rest", float(operator.voided), "")]
-    rows = [{"seed": seed, "wrong": wrong, "said": operator.said.most_common(30)}]
+    rows = [{"seed": seed, "long": long, "wrong": wrong, "said": operator.said.most_common(30)}]
     return Report("chaos", figures, [*rows, *map(asdict, operator.acts)])
 
 

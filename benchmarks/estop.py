@@ -24,7 +24,7 @@ from benchmarks.estop_presses import OpenPage, Press, RestPresser, page_load_tim
 from benchmarks.estop_station import Station, StationWatch
 from benchmarks.labs import ROOT, RunningLab, lab
 from benchmarks.report import Figure, Report
-from benchmarks.results_postgresql import server, why_not
+from benchmarks.servers import postgresql, why_no_postgresql
 from evaweb.lab.rest_client import RestClient
 from runtime.core.errors import RuntimeFault
 
@@ -77,7 +77,7 @@ def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
     for attack in attacks:
         with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as lab_bench:
             rows.append(measure_attack(lab_bench, attack, seconds))
-    missing = why_not()
+    missing = why_no_postgresql()
     if missing:
         print(f"not measured on PostgreSQL: {missing}", file=sys.stderr)
     else:
@@ -91,7 +91,7 @@ def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
 def _on_postgresql(seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "postgresql"
-        with server(database) as url, bench(Path(folder) / "lab", database, url) as lab_bench:
+        with postgresql(database) as store, bench(Path(folder) / "lab", database, store.url) as lab_bench:
             return measure_attack(lab_bench, "database_hangs", seconds) | {
                 "attack": "database_hangs.postgresql"
             }

@@ -62,12 +62,16 @@ def lab(
 
 
 @contextmanager
-def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Iterator[RunningLab]:
+def busy_lab(
+    folder: Path, assignments: Sequence[str], without: str = "", *, numbered: bool = False
+) -> Iterator[RunningLab]:
     """Yield the lab of `benchmarks.busy_lab`, with `assignments` to keys of its deployment.
 
-    `without` is a comma-separated list of measures of runtime.core.realtime that its control process omits.
+    `without` is a comma-separated list of measures of runtime.core.realtime that its control process omits. With
+    `numbered` its cameras show test patterns that contain the number of each picture, and there is no table.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
+    sets += ["--numbered"] if numbered else []
     ready = folder / "ready.json"
     path = f"{ROOT / 'benchmarks' / 'without'}{os.pathsep}{ROOT}"
     patched = {"PYTHONPATH": path, "EVA_WITHOUT": without} if without else {}

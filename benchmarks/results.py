@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Figure, Report
-from benchmarks.results_postgresql import server, why_not
+from benchmarks.servers import postgresql, why_no_postgresql
 from evaweb.statistics.sequential import success_evidence
 
 PLANS, TRIALS = 200, 100_000
@@ -55,16 +55,16 @@ def measure(
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         rows.append(_measured(Path(folder) / "sqlite", {}, plans, trials))
-        missing = why_not()
+        missing = why_no_postgresql()
         if missing:
             print(f"not measured on PostgreSQL: {missing}", file=sys.stderr)
         else:
-            with server(Path(folder) / "postgresql") as url:
-                rows.append(_measured(Path(folder) / "web", {"DATABASE_URL": url}, plans, trials))
+            with postgresql(Path(folder) / "postgresql") as store:
+                rows.append(_measured(Path(folder) / "web", {"DATABASE_URL": store.url}, plans, trials))
             if long:
-                with server(Path(folder) / "million") as url:
+                with postgresql(Path(folder) / "million") as store:
                     data = Path(folder) / "web_million"
-                    measured = _measured(data, {"DATABASE_URL": url}, MANY_PLANS, MANY_TRIALS, COPIES)
+                    measured = _measured(data, {"DATABASE_URL": store.url}, MANY_PLANS, MANY_TRIALS, COPIES)
                     rows.append(measured | {"database": "million"})
     for row in rows:
         figures += database_figures(row)
