@@ -82,7 +82,7 @@ class Headline:
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """Reservations about the headline, one text each; they leave out corrections that were made after the reveal."""
+        """Reservations about the headline, one text each, without corrections that were made after the reveal."""
         caveats = [*self.estimates]
         if self.at_first:
             caveats.append(
