@@ -17,6 +17,7 @@ OPTIONS = {
     "pages": {"plans": 2, "trials": 40},
 }
 FEWER = {
+    "glass": {"glass._MARGIN_S": 0.2},
     "lab": {"climb.RUNGS": [1, 2], "climb._MOST_VIEWERS": 10, "lab._CUTS": 2, "lab._UPLOAD_MB": 50},
     "loop": {"loop.RATES": [30.0]},
     "measures": {"measures._VARIANTS": ["", "fifo"]},
