@@ -110,7 +110,8 @@ function meant(event, hidden = false) {
 
 /**
  * Return true if the focused control needs the key itself: text fields need every key, number fields all but letters and Space,
- * lists every key except those of stop commands.
+ * lists all but those of stop commands, buttons and links Enter and Space, and sliders, radio buttons and the list of events
+ * the arrow keys.
  */
 function kept(event, element) {
   const field = event.target;

@@ -44,6 +44,6 @@ const applied = sessionStorage.getItem(APPLIED);
 if (applied) document.querySelector("form[data-applied]")?.elements[applied]?.focus();
 sessionStorage.removeItem(APPLIED);
 window.addEventListener("pageshow", () => {
-  // the user came back with the browser's Back button
+  // The user came back with the browser's Back button.
   for (const field of document.querySelectorAll("form[data-applied] :disabled")) field.disabled = false;
 });
