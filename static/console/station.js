@@ -46,7 +46,7 @@ function listen(store, events) {
     },
     events: (news) => events.add(news),
     ack: (ack) => store.tell("ack", ack),
-    // the id is that of the request
+    // The id of the answer is that of the request.
     aimed: (answer) => store.tell("aimed", { ...answer, reason: sentence({ ...answer.sentence, text: answer.reason }) }),
     renewed: (answer) => store.tell("renewed", answer),
     changed: ({ what }) => store.tell("changed", what),

@@ -1,9 +1,9 @@
 // The software e-stop: a button that never moves, Escape, and Space. While the robot is idle, ready or already stopped, Space
 // goes to the control that has the focus.
-// Escape also closes the topmost open dialog; if the robot is surely at rest, it does only that. The e-stop waits for nothing:
-// it is sent over the socket and to the process for stops at once, under one uuid, which the station carries out once. If
-// neither answers, it is posted to the web server, and if nothing answers, the page says so in red letters. estop_state.js
-// keeps which of this is true.
+// Escape closes an open dialog or menu, and presses the e-stop unless it has closed one while the robot is certainly at rest.
+// The e-stop waits for nothing: it is sent over the socket and to the process for stops at once, under one uuid, which the
+// station carries out once. If the socket is closed or neither answers, it is posted to the web server as well; if nothing
+// answers, the page says so in red letters. estop_state.js decides what is shown.
 
 import { post } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
@@ -13,9 +13,9 @@ import { t } from "../../site/sentences.js";
 
 const ACK_MS = 500;
 const ASK_MS = 5000;
-const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // keys.js takes the focus away from a control that was clicked
+const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // keys.js takes the focus away from controls that were clicked
 const AT_REST = ["idle", "ready"];
-// prepared at load, so that no press waits for a translation
+// Prepared at load, so that no press waits for a translation.
 const UNACKNOWLEDGED = t("page.estop.unacknowledged", "the software stop was not acknowledged");
 const OPEN = "dialog[open], details[open]:has(> .float)";
 const WORDS = {
@@ -215,7 +215,7 @@ function startedAfterAll(outcome) {
   delete outcome.dataset.late;
 }
 
-/** Close the dialog or menu that is last in the page; return whether one was open. */
+/** Close the last open dialog or menu in the page; return whether one was open. */
 function closeTop() {
   const top = [...document.querySelectorAll(OPEN)].filter((each) => each.checkVisibility()).at(-1);
   if (top instanceof HTMLDialogElement) top.close();

@@ -61,7 +61,7 @@ export class LeaseControls {
       this.#away = "";
       this.#heardAt = performance.now();
     }
-    // one refusal is normal right after a hand-over
+    // A single refusal is normal right after a hand-over.
     if (this.#refused > 1) this.#commands.say(t("page.lease.not_renewed", "Lease not renewed: {reason}", { reason }), "refused");
   }
 

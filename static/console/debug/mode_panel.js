@@ -3,7 +3,7 @@
 import { distanceText, buttonLabels, MODES, phaseText, primaryCommand, proposed, SIM_INPUTS, shown } from "./modes.js";
 import { t } from "../../site/sentences.js";
 
-const SETTLE_MS = 600; // time [ms] for which a button that replaced another ignores presses, which may be meant for the previous one
+const SETTLE_MS = 600; // Time [ms] for which a button that replaced another ignores presses, which may be meant for the previous one.
 const POLICY_MODES = ["sim", "step", "preview", "continuous"];
 
 export class ModePanel {

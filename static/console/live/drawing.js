@@ -1,8 +1,8 @@
 // Draws one frame of the live socket: the newest message of every stream, so that pictures and numbers are from one moment.
 
-// curves of the stream "recent" -> names under which they are drawn
+// Curves of the stream "recent" -> names under which they are drawn.
 const CURVES = { measured: "state", raw: "raw", planned: "smoothed", executed: "executed" };
-// shortest time between frames [ms] in a browser without a graphics card, which shares the processor with the robot's programs
+// Shortest time between frames [ms] in a browser without a graphics card, which shares the processor with the robot's programs.
 const SOFTWARE_FRAME_MS = 60;
 
 const nothing = { poses() {}, bench() {}, chunk() {}, aim() {}, add() {}, joints() {}, software: false };

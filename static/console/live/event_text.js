@@ -5,7 +5,7 @@ import { commandLabel, stateLabel } from "./labels.js";
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "implausible", "corrected", "too_far", "node_silent", "leader_lost"]);
 const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "recording_late", "chunk_dropped", "ik_unreached", "poses_refused", "joints_missing", "not_journalled", "unmeasured", "zero_joints", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
-// kinds that report the end of a trouble
+// Kinds that report the end of a trouble.
 const GOOD = new Set(["camera_back", "commands_heard", "joints_back", "pictures_back", "policy_back", "recording_goes_on", "recovered", "punctual", "released"]);
 const NAMES = {
   camera_absent: t("page.events.camera_absent", "camera absent"),
