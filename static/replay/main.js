@@ -1,5 +1,4 @@
-// The page of one episode: cameras, robot and curves on one clock. The pictures are shown first, everything that is drawn after
-// them.
+// The page of one episode: cameras, robot and curves on one clock. The pictures are loaded first, robot and curves after them.
 
 import { t } from "../site/sentences.js";
 import { cameras, firstPictures } from "./cameras.js";

@@ -43,7 +43,7 @@ class Editor {
     this.#faults.addEventListener("click", (event) => event.target.dataset.place && this.#find(event.target.dataset.place));
     this.#mark();
     this.#previewed();
-    document.querySelector(".scene-grid").inert = false; // earlier inputs would be lost
+    document.querySelector(".scene-grid").inert = false; // enabled only now, because earlier inputs would be lost
   }
 
   #fill() {
