@@ -1,17 +1,17 @@
-// What the buttons of the Collect page mean at each moment, and why not; nothing here touches the page.
+// What the buttons of the Collect page do at each moment, and why they are disabled; nothing here touches the page.
 
 import { t } from "../site/sentences.js";
 
 export const ARM_FIRST = t("page.collect.arm_first", "arm first");
 
-/** What the big button does now: {kind, text}. Wherever the robot moves it stops; only at rest does it start. */
+/** Return what the primary button does now: {kind, text}. While the robot moves it stops; it starts only at rest. */
 export function primaryAction({ state_is: is } = {}) {
   if (is?.preparing) return { kind: "stop", text: t("page.collect.cancel_set_up", "Cancel the set-up") };
   if (is?.run_open) return { kind: "stop", text: t("page.collect.stop_and_save", "Stop and save") };
   return { kind: "run", text: t("page.collect.start", "Start") };
 }
 
-/** Why no episode can start, "" where the station alone decides. */
+/** Return why no episode can start, or "" if the station alone decides. */
 export function startProblem(snapshot, session) {
   const { collect } = snapshot ?? {};
   if (!collect) return t("page.collect.collects_nothing", "this station collects nothing");
@@ -20,25 +20,25 @@ export function startProblem(snapshot, session) {
   return collect.armed ? "" : ARM_FIRST;
 }
 
-/** The episode that a label or a discarding is about: the open one, else the newest that was seen. */
+/** Return the episode that a label or Discard refers to: the open one, else the last one seen. */
 export function labelTarget(collect, seen) {
   return collect?.episode ?? seen ?? collect?.last?.uuid ?? "";
 }
 
-/** Why nothing can be said of an episode now, "" where it can. */
+/** Return why no label can be given to the episode now, or "" if one can. */
 export function labelProblem({ state_is: is, collect } = {}, episode) {
   if (collect?.episode && is?.run_open) return t("page.collect.stop_first", "stop and save first");
   if (!episode) return t("page.collect.no_episode", "no episode yet");
   return discarded(collect, episode) ? t("page.collect.is_discarded", "the episode is discarded") : "";
 }
 
-/** Why nothing can be discarded now, "" where it can. */
+/** Return why the episode cannot be discarded now, or "" if it can. */
 export function discardProblem({ collect } = {}, episode) {
   if (!episode) return t("page.collect.no_episode", "no episode yet");
   return discarded(collect, episode) ? t("page.collect.is_discarded_already", "the episode is discarded already") : "";
 }
 
-/** What goes with a discarding: the open episode is not named, for it ends by that; every other one is. */
+/** Return the arguments of Discard: an open episode is not named, because discarding ends it; any other is. */
 export function discardArguments(collect, episode) {
   return collect?.episode === episode ? {} : { episode };
 }
@@ -47,7 +47,7 @@ function discarded(collect, episode) {
   return collect?.last?.uuid === episode && collect.last.discarded;
 }
 
-/** What is known of who leads, in words; weight "bad" where an episode cannot be led. */
+/** Describe the leader in words: {text, weight}; the weight is "bad" if no episode can be led. */
 export function leaderText(collect) {
   const { leader, source, mode } = collect ?? {};
   if (!leader) return { text: "", weight: "" };
@@ -59,14 +59,14 @@ export function leaderText(collect) {
   return leader.state === "absent" ? { text: collect.set_up ? t("page.collect.leader_unheard", "{how}: not heard yet", { how }) : how, weight: collect.set_up ? "bad" : "" } : { text: silent, weight: "bad" };
 }
 
-/** The arm in words: that the next episode may begin, or why it may not. */
+/** Say in words whether the next episode may begin, or why not. */
 export function armText({ state_is: is, collect } = {}) {
   if (!collect) return "";
   if (collect.episode && is?.going) return t("page.collect.recording", "recording");
   return collect.armed ? t("page.collect.armed_start", "armed: Start begins an episode") : collect.why_not || t("page.collect.not_armed", "not armed");
 }
 
-/** The step to do now. */
+/** Return the step to do now; `opened` is truthy if a session is open. */
 export function collectStep(snapshot, opened) {
   const { state_is: is, collect } = snapshot ?? {};
   if (!opened) return "session";
@@ -76,36 +76,39 @@ export function collectStep(snapshot, opened) {
   return last && !last.result && !last.discarded ? "result" : "record";
 }
 
-/** Something that cannot be taken back is asked about once: that stands until it is pressed again, or anything else is. */
+/**
+ * Confirmation of an action that cannot be undone: the first press asks, and the question stands until the same button or
+ * anything else is pressed.
+ */
 export class Twice {
   #what = "";
   #about = "";
   #forgotten;
 
-  /** `forgotten(what)` hears of a question that was not answered. */
+  /** `forgotten(what)` is called for a question that was dropped without an answer. */
   constructor(forgotten) {
     this.#forgotten = forgotten;
   }
 
-  /** What is asked about from now on: a question about anything else is forgotten. */
+  /** Set what questions are about from now on; a question about anything else is dropped. */
   about(subject) {
     if (subject !== this.#about) this.clear();
     this.#about = subject;
   }
 
-  /** Whether `what` is being asked about at the moment. */
+  /** Return whether the question for `what` is open. */
   asks(what) {
     return what !== "" && this.#what === what;
   }
 
-  /** Press for `what`; true where that was the second time. */
+  /** Take in a press for `what`; return true if it confirms the open question. */
   press(what) {
     const again = this.asks(what);
     this.#what = again ? "" : what;
     return again;
   }
 
-  /** Forget what was asked. */
+  /** Drop the open question. */
   clear() {
     const what = this.#what;
     this.#what = "";

@@ -1,4 +1,5 @@
-// The Collect page: a session opened or resumed, episodes armed, recorded, labelled, discarded; the queue and the dataset.
+// The Collect page: sessions are opened and resumed, episodes armed, recorded, labelled and discarded; it shows the queue and
+// the dataset.
 
 import { config } from "../console/live/config.js";
 import { post, RequestFailed } from "../site/api.js";
@@ -7,8 +8,8 @@ import { ARM_FIRST, armText, primaryAction, discardArguments, leaderText, labelT
 import { gamepads } from "./pads.js";
 import { t } from "../site/sentences.js";
 
-const SETTLE_MS = 600; // a Start that took the place of Stop is not yet pressed by the hand that pressed Stop
-const REST_MS = 10000; // for the robot to be at rest before it is recorded again
+const SETTLE_MS = 600; // time [ms] for which a Start that replaced Stop ignores presses, which may be meant for Stop
+const REST_MS = 10000; // longest wait for the robot to come to rest before a new recording [ms]
 const QUEUE_MS = 2000;
 const OF_SESSIONS = ["collect", "episode", "job"];
 const [OPEN, PUBLISH] = [t("page.collect.open", "Open"), t("page.collect.publish", "Publish")];
@@ -36,9 +37,9 @@ export class CollectPanel {
   #commands;
   #busy = "";
   #twice = new Twice(() => this.#commands.say(t("page.collect.forgotten", "Not pressed again: nothing was done"), "pressed"));
-  #seen = ""; // the newest episode that this page knows of
-  #closed = ""; // the newest that is on disk
-  #older = ""; // one after which a start was pressed that did not take: it is not the newest attempt
+  #seen = ""; // the newest episode that this page knows
+  #closed = ""; // the newest episode that is on disk
+  #older = ""; // episode after which Start was pressed without effect, so that it is not the newest attempt
   #kind = "run";
   #changed = -Infinity;
   #drawnQueue = 0;
@@ -53,22 +54,22 @@ export class CollectPanel {
     document.body.addEventListener("htmx:afterSettle", () => this.draw());
     store.on("second", () => this.#follow());
     store.on("changed", (what) => what.some((name) => OF_SESSIONS.includes(name)) && this.refresh());
-    otherPresses((target) => target.closest?.("[data-collect]"), () => this.#unasked()); // before a pedal's keys are heard
+    otherPresses((target) => target.closest?.("[data-collect]"), () => this.#unasked()); // added before the listener for a pedal's keys
     gamepads((action) => this.#pressed(action));
     this.draw();
   }
 
-  /** The uuid of the open session, "" for none. */
+  /** Uuid of the open session, or "". */
   get session() {
     return document.querySelector("[data-session-uuid]")?.dataset.sessionUuid ?? "";
   }
 
-  /** Fetch both fragments anew. */
+  /** Fetch both fragments again. */
   refresh() {
     for (const id of ["session", "progress"]) window.htmx.trigger(`#${id}`, "eva:collect");
   }
 
-  /** While the worker is at it, what is left changes without anything in the database. */
+  /** Refresh the queue while the worker is busy: its progress changes without any change in the database. */
   #follow() {
     if (!document.querySelector('[data-queue="active"]') || performance.now() - this.#drawnQueue < QUEUE_MS) return;
     this.#drawnQueue = performance.now();
@@ -96,7 +97,7 @@ export class CollectPanel {
     this.#commands.gate();
   }
 
-  /** The open episode is the newest, and stays so until another one was closed. */
+  /** Keep track of the newest episode: the open one, until another one is closed. */
   #notice(collect) {
     const closed = collect?.last?.uuid ?? "";
     if (collect?.episode) this.#seen = collect.episode;
@@ -151,17 +152,17 @@ export class CollectPanel {
     if (!select.value) return;
     const field = document.getElementById("session-task");
     field.value = select.value;
-    field.dispatchEvent(new Event("input", { bubbles: true })); // a draft of it
+    field.dispatchEvent(new Event("input", { bubbles: true })); // saves it as a draft
     select.value = "";
   }
 
-  /** A gamepad presses what a finger would. */
+  /** Click the button that belongs to a gamepad's action. */
   #pressed(action) {
     const place = ["success", "partial", "fail"].includes(action) ? `[data-result="${action}"][data-collect]` : `[data-collect="${action}"]`;
     document.querySelector(place)?.click();
   }
 
-  /** Something was pressed that is none of these buttons. */
+  /** Drop the open question, because something other than these buttons was pressed. */
   #unasked() {
     this.#twice.clear();
     this.draw();
@@ -199,7 +200,7 @@ export class CollectPanel {
     };
     const before = this.#busy;
     this.#busy = what;
-    if (document.activeElement?.matches("#seed, #open-session input")) document.activeElement.blur(); // the keys are free again
+    if (document.activeElement?.matches("#seed, #open-session input")) document.activeElement.blur(); // frees the keys again
     try {
       await acts[what]();
     } finally {
@@ -212,7 +213,7 @@ export class CollectPanel {
     return labelTarget(this.#store.snapshot?.collect, this.#seen);
   }
 
-  /** What a question is about: session and episode, until that is discarded. */
+  /** What a question is about: session, episode, and whether that is discarded already. */
   get #asked() {
     return [this.session, this.#episode, discardProblem(this.#store.snapshot ?? {}, this.#episode)].join();
   }
@@ -232,7 +233,7 @@ export class CollectPanel {
     return answer;
   }
 
-  /** Of the newest attempt; of one before a start that did not take it asks once. */
+  /** Label the newest attempt; if the last Start had no effect, ask once before the previous episode is labelled. */
   async #label(result) {
     const episode = this.#episode;
     if (episode && episode === this.#older && !this.#twice.press(result)) {
@@ -263,7 +264,7 @@ export class CollectPanel {
     else await this.#start();
   }
 
-  /** Wait until an episode can start; why it cannot after all, "" where it can. */
+  /** Wait until an episode can start; resolve to why it cannot, or to "". */
   async #rested() {
     const until = performance.now() + REST_MS;
     let why = "";
@@ -278,7 +279,7 @@ export class CollectPanel {
     return why || t("page.collect.not_at_rest", "the robot is not at rest");
   }
 
-  /** One request to the web, with its outcome on the page. */
+  /** Send one request to the web server and show its outcome on the page. */
   async #ask(name, address, content = {}) {
     this.#commands.say(t("page.common.pressed", "{name}: pressed …", { name }), "pressed");
     try {
@@ -309,7 +310,7 @@ function show(name) {
   return document.querySelector(`[data-collect-show="${name}"]`);
 }
 
-/** What a button is called, without its key. */
+/** Return a button's name without its key. */
 function nameOf(button) {
   return button.textContent.replace(/\s+\S+$/, "").trim();
 }

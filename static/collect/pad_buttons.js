@@ -1,9 +1,9 @@
-// The buttons of gamepads as presses: of a button that went down while we looked, never of one that was held before.
-// A pedal is a keyboard: its key can stand in the place of a button.
+// Presses of gamepad buttons: a button counts when it goes down while the pad is observed, never if it was held before.
+// A pedal acts as a keyboard: its key can be assigned in place of a button.
 
 import { t } from "../site/sentences.js";
 
-/** What can be pressed by a pad, and which button does it as delivered (numbers of the standard mapping). */
+/** The actions that a pad can trigger, with their default buttons (numbers of the standard mapping). */
 export const ACTIONS = {
   arm: { name: t("page.pads.arm", "Arm, disarm"), button: 9 },
   big: { name: t("page.pads.big", "Start; stop and save"), button: 0 },
@@ -16,7 +16,7 @@ export const ACTIONS = {
 
 const NAMES = ["A", "B", "X", "Y", "LB", "RB", "LT", "RT", "Back", "Start", t("page.pads.left_stick", "left stick"), t("page.pads.right_stick", "right stick"), t("page.pads.up", "up"), t("page.pads.down", "down"), t("page.pads.left", "left"), t("page.pads.right", "right"), "Guide"];
 
-/** A button as it stands on a pad of the standard mapping, else its number; a key by its name. */
+/** Return a button's name on a pad of the standard mapping, else its number; a key by its name. */
 export function buttonName(button, mapping) {
   if (button === null || button === undefined) return t("page.pads.none", "none");
   if (typeof button === "string") return t("page.pads.key", "key {key}", { key: button.length === 1 ? button.toUpperCase() : button });
@@ -27,20 +27,20 @@ export function defaultMapping() {
   return Object.fromEntries(Object.entries(ACTIONS).map(([action, { button }]) => [action, button]));
 }
 
-/** Why a key cannot be that of a pedal, "" where it can; `taken` are the keys that the page has. */
+/** Return why a key cannot be assigned to a pedal, or "" if it can; `taken` are the keys that the page uses. */
 export function whyNotKey(key, taken) {
   if (key === " " || key === "Escape") return t("page.pads.is_estop", "{key} is the e-stop", { key: key === " " ? "Space" : "Esc" });
   if (/^(Tab|Shift|Control|Alt|Meta|AltGraph|CapsLock|Dead|Process|Unidentified)$/.test(key)) return t("page.pads.alone", "{key} alone cannot be assigned", { key });
   return taken.includes(key.toLowerCase()) || key === "?" ? t("page.pads.used", "the page already uses {key}", { key }) : "";
 }
 
-/** `mapping` with `action` on `button`, or on a key; whatever was on that before is on none. */
+/** Return `mapping` with `action` on `button`, which may be a key; an action that had it before has none. */
 export function withAssignment(mapping, action, button) {
   const freed = Object.entries(mapping).map(([other, at]) => [other, at === button ? null : at]);
   return { ...Object.fromEntries(freed), [action]: button };
 }
 
-/** What was kept, as far as it is a mapping; the delivered one for the rest. */
+/** Parse a stored mapping; use the default for every invalid part. */
 export function parseMapping(text) {
   let kept = {};
   try {
@@ -52,11 +52,11 @@ export function parseMapping(text) {
   return Object.fromEntries(Object.entries(defaultMapping()).map(([action, at]) => [action, fits(kept[action]) ? kept[action] : at]));
 }
 
-/** Follows pads from look to look. */
+/** Detects presses by comparing the pads with their previous state. */
 export class Presses {
   #held = new Map(); // index -> {id, buttons}
 
-  /** The buttons that went down since the last look: [{pad, button}]. A pad that is new, or another, only begins. */
+  /** Return the buttons that went down since the last call: [{pad, button}]. A pad that is new or was exchanged has none. */
   look(pads) {
     const pressed = [];
     const there = new Set();
@@ -74,7 +74,7 @@ export class Presses {
     return pressed;
   }
 
-  /** Begin anew: whatever is held now does nothing. */
+  /** Forget the states of all buttons, so that buttons held now count as no presses. */
   forget() {
     this.#held.clear();
   }

@@ -1,14 +1,14 @@
-// A gamepad at the Collect page: looked at while the page is visible, its buttons shown and changed. A pedal's key, too.
+// Gamepads and pedals on the Collect page: polled while the page is visible; their buttons are shown and can be changed.
 
 import { PRESSED } from "../site/presses.js";
 import { ACTIONS, withAssignment, buttonName, defaultMapping, Presses, parseMapping, whyNotKey } from "./pad_buttons.js";
 import { t } from "../site/sentences.js";
 
 const KEY = "eva-pad";
-const TYPED = 'input, textarea, select, [contenteditable="true"]'; // keep their keys
-const LATE_MS = 500; // between two looks: what happened meanwhile is nobody's press
+const TYPED = 'input, textarea, select, [contenteditable="true"]'; // fields that need their keys
+const LATE_MS = 500; // pause between two polls [ms] after which changes of buttons count as no presses
 
-/** `press(action)` hears what is pressed; resolves nothing, goes on as long as the page lives. */
+/** Call `press(action)` for every press of an assigned button, as long as the page exists. */
 export function gamepads(press) {
   const presses = new Presses();
   const part = (name) => document.querySelector(`[data-pad="${name}"]`);
@@ -63,11 +63,11 @@ export function gamepads(press) {
     if (event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.target.closest?.(TYPED)) return;
     const { key } = event;
     if (!changing && !Object.values(mapping).includes(key)) return;
-    if (changing && /^(Enter| |Tab)$/.test(key) && event.target.closest?.("button")) return; // Cancel, by the keyboard
+    if (changing && /^(Enter| |Tab)$/.test(key) && event.target.closest?.("button")) return; // the keyboard presses Cancel
     const why = whyNotKey(key, [...document.querySelectorAll("[data-key]")].map(({ dataset }) => dataset.key));
     if (why) part("said").textContent = why;
     else {
-      event.preventDefault(); // which keys.js heeds
+      event.preventDefault(); // keys.js ignores the event then
       pressed(key);
     }
   }

@@ -1,4 +1,4 @@
-// The home page: how each station stands and what its first camera shows, asked every few seconds.
+// The home page: each station's state and the picture of its first camera, requested every few seconds.
 
 import { get, RequestFailed } from "../site/api.js";
 import { quietFragments } from "../site/fragments.js";
@@ -29,7 +29,7 @@ function show(element, session) {
   element.textContent = session ? session.label : t("page.home.not_running", "not running");
 }
 
-/** The newest picture in place of the one before, which stays until it is here; none where there is none. */
+/** Replace a picture by the newest one once that is loaded; hide it if there is none. */
 async function look(shown) {
   const fresh = shown.cloneNode();
   fresh.src = `${shown.dataset.still}?at=${Date.now()}`;
@@ -38,7 +38,7 @@ async function look(shown) {
     fresh.hidden = false;
     shown.replaceWith(fresh);
   } catch (error) {
-    if (error.name !== "EncodingError") throw error; // what an answer without a picture is to a browser
+    if (error.name !== "EncodingError") throw error; // a browser's error for an answer that is not a picture
     shown.hidden = true;
   }
 }

@@ -1,4 +1,4 @@
-// A page bound to a station: everything it shows and asks, put together.
+// Puts together everything that the page of a station shows and requests.
 
 import { CollectPanel } from "../collect/collect.js";
 import { drafts } from "../site/drafts.js";
@@ -31,7 +31,7 @@ import { TrialPanel } from "./trial/trial.js";
 import { applyRedaction } from "./trial/redaction.js";
 import { CLOSE_REASONS } from "./live/labels.js";
 
-/** What hears the messages of the socket; those that are for a part of the page the store tells to it. */
+/** Return the handler of the socket's messages; those for one part of the page go to the listeners of the store. */
 function listen(store, events) {
   const answers = {
     hello: ({ facts, role }) => {
@@ -41,12 +41,13 @@ function listen(store, events) {
       store.tell("hello");
     },
     link: (link) => {
-      store.link = { ...link, told: true }; // before that nothing is wrong yet
+      store.link = { ...link, told: true }; // until then a missing link is no problem
       store.tell("link");
     },
     events: (news) => events.add(news),
     ack: (ack) => store.tell("ack", ack),
-    aimed: (answer) => store.tell("aimed", { ...answer, reason: sentence({ ...answer.sentence, text: answer.reason }) }), // its id is the question's
+    // The id of the answer is that of the request.
+    aimed: (answer) => store.tell("aimed", { ...answer, reason: sentence({ ...answer.sentence, text: answer.reason }) }),
     renewed: (answer) => store.tell("renewed", answer),
     changed: ({ what }) => store.tell("changed", what),
     error: ({ reason }) => console.error(`the server did not understand this page: ${reason}`),
@@ -75,7 +76,7 @@ async function start() {
     },
     expected: () => store.link.ok,
   });
-  new EStop(store, socket, way); // first of all that can be pressed
+  new EStop(store, socket, way); // before any other control
   keyboard((words) => commands.say(words, "refused"));
   statusBar(store);
   const commands = new Commands(store, socket, way);

@@ -1,9 +1,9 @@
-// A line of hints for who has a simulated station for the first time: the next thing to press, until it is hidden.
+// A line of hints for users who have a simulated station for the first time: what to press next, until the hints are hidden.
 
 import { currentStep } from "./trial/steps.js";
 import { t } from "../site/sentences.js";
 
-const KEY = "eva-tour"; // of this browser: "off" once the hints were hidden
+const KEY = "eva-tour"; // key in this browser; "off" once the hints were hidden
 const HINTS = {
   free: t("page.tour.free", "Take the station: you command, all others watch."),
   choose: t("page.tour.choose", "Choose a position, then press Set up."),
@@ -20,7 +20,7 @@ function hint(store) {
   return HINTS[store.snapshot?.state_is?.run_open ? "running" : step] ?? "";
 }
 
-/** Show the hints where the page has a place for them. */
+/** Show the hints if the page has a place for them. */
 export function tour(store) {
   const line = document.getElementById("tour");
   if (!line || localStorage.getItem(KEY) === "off") return;

@@ -1,10 +1,10 @@
-// First steps: what was typed is kept, and the pictures of cameras are those of now.
+// First steps: typed values are kept as drafts, and the cameras' pictures are live.
 
 import { drafts } from "../site/drafts.js";
 
 const EVERY_MS = 1000;
 
-/** Ask for a picture again and again, one request at a time; where it does not come, what stood there says so. */
+/** Load a picture again and again, one request at a time; if it does not load, its alternative text is shown. */
 function live(image) {
   const address = image.src;
   const next = () => setTimeout(() => (document.hidden ? next() : (image.src = `${address}?${Date.now()}`)), EVERY_MS);
@@ -15,5 +15,5 @@ function live(image) {
 
 drafts();
 document.querySelectorAll("[data-live-picture]").forEach(live);
-// What was sent is saved or comes back in the page: the draft of the browser is not needed any more.
+// What was submitted is either saved or shown in the next page, so the browser's draft is no longer needed.
 document.addEventListener("submit", ({ target }) => target.dispatchEvent(new Event("eva:saved", { bubbles: true })));

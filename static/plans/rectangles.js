@@ -1,20 +1,20 @@
-// Rectangles on a picture, in shares of its width and height: {x, y, width, height}, always inside.
+// Rectangles on a picture, as shares of its width and height: {x, y, width, height}, always inside the picture.
 
-export const MIN_SIDE = 0.02; // of a side: less is a slip of the hand
+export const MIN_SIDE = 0.02; // least side of a rectangle; a smaller one was drawn by accident
 
-/** The rectangle between two points, in whatever order they were pressed. */
+/** Return the rectangle between two points, in any order. */
 export function fromPoints(a, b) {
   const [x, y] = [clamped(Math.min(a.x, b.x)), clamped(Math.min(a.y, b.y))];
   return rounded({ x, y, width: clamped(Math.max(a.x, b.x)) - x, height: clamped(Math.max(a.y, b.y)) - y });
 }
 
-/** The same rectangle elsewhere, pushed back where it would leave the picture. */
+/** Return the rectangle moved, but not beyond the edges of the picture. */
 export function translate(rectangle, dx, dy) {
   const { width, height } = rectangle;
   return rounded({ ...rectangle, x: within(rectangle.x + dx, 1 - width), y: within(rectangle.y + dy, 1 - height) });
 }
 
-/** One of its numbers changed; the others give way where it would leave the picture. */
+/** Return the rectangle with one number changed; the other number of that direction gives way at the edge of the picture. */
 export function withValue(rectangle, key, value) {
   const along = { x: ["x", "width"], width: ["x", "width"], y: ["y", "height"], height: ["y", "height"] }[key];
   const given = clamped(Number.isFinite(value) ? value : 0);
@@ -23,7 +23,7 @@ export function withValue(rectangle, key, value) {
   return rounded({ ...rectangle, [size]: given, [place]: Math.min(rectangle[place], 1 - given) });
 }
 
-/** A name that none of the others has. */
+/** Return a name that is not among `names`. */
 export function unusedName(names) {
   let k = 1;
   while (names.includes(`object ${k}`)) k += 1;
@@ -38,7 +38,7 @@ function within(value, most) {
   return Math.min(Math.max(value, 0), most);
 }
 
-/** To tenths of a thousandth, so that numbers that are typed and shown are those that are saved. */
+/** Round to 1e-4, so that the numbers that are typed and shown are those that are saved. */
 function rounded(rectangle) {
   const round = (value) => Math.round(value * 10000) / 10000;
   const { x, y, width, height } = rectangle;

@@ -1,11 +1,11 @@
-// Regions of a reference picture: drawn with mouse or finger, or typed, and saved as another reference.
+// Regions of a reference picture: drawn by mouse or touch, or typed, and saved as a new reference.
 
 import { post } from "../site/api.js";
 import { t } from "../site/sentences.js";
 import { fromPoints, withValue, unusedName, MIN_SIDE, translate } from "./rectangles.js";
 
 const NUMBERS = ["x", "y", "width", "height"];
-const CROP = 96; // pixels of a preview's longer side
+const CROP = 96; // longer side of a preview [px]
 
 class Drawing {
   #picture = document.getElementById("drawing");
@@ -35,7 +35,7 @@ class Drawing {
     return { x: (event.clientX - box.left) / box.width, y: (event.clientY - box.top) / box.height };
   }
 
-  /** On a region it is moved, at its corner it is given another size, beside them a new one is drawn. */
+  /** Start a drag: on a region it moves the region, at a region's corner it resizes it, elsewhere it draws a new one. */
   #pressed(event) {
     if (event.button !== 0) return;
     event.preventDefault();
@@ -115,7 +115,7 @@ class Drawing {
     this.#draw();
   }
 
-  /** The rectangles over the picture, and what each of them cuts out of it. */
+  /** Draw the rectangles over the picture, and a preview of what each cuts out. */
   #draw() {
     const boxes = this.#regions.map((region, index) => {
       const box = document.createElement("div");

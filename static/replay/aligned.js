@@ -1,8 +1,10 @@
-// Episodes on one time axis: when each begins, how long all of it is, its curves on common times.
+// Several episodes on one time axis: when each begins, how long they are together, and their curves at common times.
 
 import { lastNotAbove } from "../site/binary_search.js";
 
-/** When each of `count` episodes begins: `offsets` [s] as said, `shifts` [s] on a clock that begins with the first. */
+/**
+ * Return when each of `count` episodes begins: `offsets` [s] as given, `shifts` [s] on a clock that begins with the first one.
+ */
 export function startTimes(said, count) {
   const numbers = (said ?? "").split(",").map(Number);
   const offsets = Array.from({ length: count }, (_, index) => (Number.isFinite(numbers[index]) ? numbers[index] : 0));
@@ -10,19 +12,22 @@ export function startTimes(said, count) {
   return { offsets, shifts: offsets.map((offset) => offset - first) };
 }
 
-/** {fps, frames} of a clock on which all of the `episodes` ({fps, frames}) fit; its rows are those of the fastest. */
+/** Return {fps, frames} of a clock that covers all `episodes` ({fps, frames}); it has the rate of the fastest. */
 export function commonClock(episodes, { shifts }) {
   const fps = Math.max(...episodes.map((episode) => episode.fps));
   const end = Math.max(...episodes.map(({ frames, fps: own }, index) => shifts[index] + frames / own));
   return { fps, frames: Math.max(1, Math.ceil(end * fps - 1e-6)) };
 }
 
-/** The times of all rows of a clock [s]. */
+/** Return the times of all rows of a clock [s]. */
 export function clockTimes({ fps, frames }) {
   return Array.from({ length: frames }, (_, row) => row / fps);
 }
 
-/** The joint [index of `joints`] whose state differs most between the episodes at a time; the first where none does. */
+/**
+ * Return the index in `joints` of the joint whose state differs most between the episodes at one time; the first if none
+ * differs.
+ */
 export function differing(times, read, joints) {
   const spreads = joints.map((joint) => {
     const states = read.map((episode) => sampleAt(times, episode, joint).state);
@@ -34,7 +39,10 @@ export function differing(times, read, joints) {
   return spreads.indexOf(Math.max(...spreads));
 }
 
-/** State and executed action of a joint at `times`; null where the episode has none: {state, executed}. */
+/**
+ * Return state and executed action of a joint at `times` as {state, executed}; null at times for which the episode has no
+ * value.
+ */
 export function sampleAt(times, { header, numbers, shift }, joint) {
   const index = header.joints.indexOf(joint);
   const { arrays } = header.streams.ticks;

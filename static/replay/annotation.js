@@ -1,4 +1,4 @@
-// Segments of an episode: begun and ended by keys at the cursor or drawn on their lane, with the lab's vocabulary.
+// Segments of an episode, labelled with the lab's vocabulary: begun and ended by keys at the cursor, or drawn on their lane.
 
 import { get, post } from "../site/api.js";
 import { t } from "../site/sentences.js";
@@ -17,9 +17,12 @@ export class Annotation {
   #labels = []; // [{words, colour, key}]
   #segments = [];
   #begun = null; // {row, label} of a segment that has no end yet
-  #edited = null; // what the form is about: {first, last, segment?}
+  #edited = null; // what the form edits: {first, last, segment?}
 
-  /** `ask(request, done)` sends one and shows the answer, `tell(sentence, bad)` says something; `open` and `close` forms. */
+  /**
+   * `ask(request, done)` sends a request and shows the answer, `tell(sentence, bad)` shows a sentence; `open` and `close`
+   * handle forms.
+   */
   constructor({ clock, bar, ask, tell, open, close }) {
     [this.#clock, this.#bar, this.#ask, this.#tell, this.#open, this.#close] = [clock, bar, ask, tell, open, close];
     const strip = element("segments");
@@ -34,7 +37,7 @@ export class Annotation {
     this.#offer();
   }
 
-  /** The lab's vocabulary as buttons; it is wanted by no more than this, and its failure is said. */
+  /** Load the lab's vocabulary and show it as buttons. Nothing else needs it, and a failure is only reported. */
   async #offer() {
     try {
       this.#labels = await get(this.#bar.dataset.labels);
@@ -56,7 +59,7 @@ export class Annotation {
     return button;
   }
 
-  /** Show the segments that there are. */
+  /** Show these segments. */
   show(segments) {
     this.#segments = segments;
     this.#lane.show(segments, new Map(this.#labels.map(({ words, colour }) => [words, colour])));
@@ -65,24 +68,24 @@ export class Annotation {
     this.at();
   }
 
-  /** What belongs to the row that is shown: the band of the segment that has no end yet. */
+  /** Draw the unfinished segment up to the row that is shown. */
   at() {
     this.#lane.open(this.#edited ? { ...this.#edited, label: "" } : this.#begun && { first: this.#begun.row, last: this.#clock.row, label: this.#begun.label });
   }
 
-  /** What is being marked from now on: {row, label} of a segment that has no end yet, null for none. */
+  /** Set the segment being marked: {row, label} of one that has no end yet, or null for none. */
   #mark(begun) {
     this.#begun = begun;
     for (const button of element("segment-vocabulary").children) button.setAttribute("aria-pressed", String(begun?.label === button.dataset.label));
     this.at();
   }
 
-  /** The label that has `key`; undefined where none has. */
+  /** Return the label that has `key`, or undefined. */
   labelOf(key) {
     return this.#labels.find((label) => label.key === key)?.words;
   }
 
-  /** A part of that label begins at this row, or ends here; one of another label ends before this row. */
+  /** Begin a segment of that label at this row, or end it here; an open segment of another label ends before this row. */
   mark(label) {
     const { row } = this.#clock;
     if (this.#edited) {
@@ -123,7 +126,7 @@ export class Annotation {
     if (found) this.#ask(() => post(`${this.#bar.dataset.segments}/${found.uuid}/remove`, {}), t("page.segments.removed", "“{label}” is removed.", { label: found.label }));
   }
 
-  /** Nothing is being written any more. */
+  /** Discard what is being edited. */
   cancel() {
     this.#done();
   }
@@ -155,7 +158,7 @@ export class Annotation {
     return this.#ask(() => post(this.#bar.dataset.segments, content), done);
   }
 
-  /** The user's shortest segment at this row; says so where there is none. */
+  /** Return the user's shortest segment at this row; report it if there is none. */
   #own() {
     const { row } = this.#clock;
     const own = this.#segments.filter((one) => one.annotator === this.#bar.dataset.user && one.first <= row && row <= one.last);

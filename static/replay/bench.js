@@ -1,9 +1,9 @@
-// The things on a simulated bench, where they lay at the row of the clock; drawn by the scene as on the station's pages.
+// The objects on a simulated bench at the row of the clock, drawn in the scene as on the station's pages.
 
 import { get } from "../site/api.js";
 import { lastNotAbove } from "../site/binary_search.js";
 
-/** Draw in `scene` what `address` says of the bench; nothing where it says nothing. */
+/** Draw the bench's course from `address` in `scene`; do nothing if none was recorded. */
 export async function followBench(scene, clock, address) {
   const { course } = await get(address);
   if (!course.length) return;

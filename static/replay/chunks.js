@@ -1,19 +1,19 @@
-// Which chunk owns each step, which steps several chunks made, and what is known of a chunk.
+// Which chunk owns each step, which chunks contributed to it, and what is known about each chunk.
 
 import { lastNotAbove } from "../site/binary_search.js";
 
 const NONE = -1;
 
 export class Chunks {
-  #time; // of the ticks [s]
-  #owner; // chunk with the largest weight, -1 none, 0 the held target
-  #makers; // tick k was made of the entries makers[k] to makers[k + 1]
+  #time; // times of the ticks [s]
+  #owner; // chunk with the largest weight; -1 for none, 0 for the held target
+  #makers; // contributions to tick k are entries makers[k] up to, not including, makers[k + 1]
   #maker; // {chunk, weight}
   #known; // {id, observed, arrived, delay, mistimed, overlap, rows, first, last, strategy, inference}
   #strategies;
   #period;
 
-  /** `ticks`, `makers` and `chunks` are the streams of the episode's curves; `period` is that of the ticks [s]. */
+  /** `ticks`, `makers` and `chunks` are streams of the episode's curves; `period` is the period of the ticks [s]. */
   constructor({ ticks, makers, chunks, strategies, period }) {
     this.#time = ticks.time;
     this.#owner = ticks.chunk;
@@ -30,7 +30,10 @@ export class Chunks {
     return this.#makers[tick + 1] - this.#makers[tick];
   }
 
-  /** Ticks in a row with the same value, [{from, to, id}] in seconds, without those of value `none`. */
+  /**
+   * Return the stretches of ticks with the same value as [{from, to, id, next}], from and to in seconds, without those of value
+   * `none`.
+   */
   #spans(value, none) {
     const found = [];
     for (let tick = 0; tick < this.#time.length; tick += 1) {
@@ -43,19 +46,19 @@ export class Chunks {
     return found;
   }
 
-  /** When the next tick begins, or, before a gap, when it should have. */
+  /** Return when the next tick begins, or 1.5 periods after this one if a gap follows. */
   #end(tick) {
     const next = this.#time[tick + 1] ?? Infinity;
     return Math.min(next, this.#time[tick] + 1.5 * this.#period);
   }
 
-  /** The chunk that owns the step at `time`, -1 where there is none. */
+  /** Return the chunk that owns the step at `time`, or -1 if there is none. */
   ownerAt(time) {
     const tick = lastNotAbove(this.#time, time);
     return tick < 0 || time >= this.#end(tick) ? NONE : this.#owner[tick];
   }
 
-  /** What made the step at `time`: [{id, weight}], the largest share first. */
+  /** Return the contributions to the step at `time`: [{id, weight}], largest first. */
   makersAt(time) {
     const tick = lastNotAbove(this.#time, time);
     if (tick < 0) return [];
@@ -64,7 +67,7 @@ export class Chunks {
     return found.sort((one, other) => other.weight - one.weight);
   }
 
-  /** What is known of chunk `id`; null for the held target and for one that no policy gave. */
+  /** Return what is known about chunk `id`; null for the held target and for a chunk that no policy gave. */
   about(id) {
     const at = lastNotAbove(this.#known.id, id);
     if (at < 0 || this.#known.id[at] !== id) return null;

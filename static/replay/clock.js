@@ -1,7 +1,7 @@
-// One clock for everything on the page: row k is shown from k / fps on.
+// The one clock of a page: row k is shown from k / fps on.
 
-const LONGEST_STEP_S = 0.25; // a tab that slept does not jump
-const ROUNDING = 1e-6; // rows: sums of tenths of a millisecond come out a little below the row they reach
+const LONGEST_STEP_S = 0.25; // prevents a jump after a tab was suspended
+const ROUNDING = 1e-6; // rows: sums of small steps end slightly below the row that they reach
 
 export class Clock extends EventTarget {
   #fps;
@@ -11,7 +11,7 @@ export class Clock extends EventTarget {
   #playing = false;
   #ready = [];
   #before = 0;
-  #range = null; // {from, to}: the first row of what is played, and the one after its last
+  #range = null; // {from, to}: first row that is played, and the row after the last one
   #loop = false;
 
   constructor({ fps, frames }) {
@@ -20,7 +20,7 @@ export class Clock extends EventTarget {
     this.#frames = frames;
   }
 
-  /** `ready` says whether what follows the clock can go on; while it cannot, the clock waits. */
+  /** `ready()` returns whether something that follows the clock can continue; the clock waits until all can. */
   waitFor(ready) {
     this.#ready.push(ready);
   }
@@ -58,17 +58,17 @@ export class Clock extends EventTarget {
     this.#tell("rate");
   }
 
-  /** The rows that are played: [from, to), all of them without a range. */
+  /** The rows that are played, [from, to); all rows if no range is set. */
   get range() {
     return this.#range ?? { from: 0, to: this.#frames };
   }
 
-  /** Whether only a part is played. */
+  /** True if only a part is played. */
   get narrowed() {
     return this.#range !== null;
   }
 
-  /** Play the rows from `from` to the one before `to` alone; null: all of them. */
+  /** Play only the rows from `from` to before `to`; null plays all. */
   narrow(range) {
     const from = range && Math.min(Math.max(0, Math.floor(range.from)), this.#frames - 1);
     this.#range = range && { from, to: Math.min(Math.max(from + 1, Math.floor(range.to)), this.#frames) };
@@ -106,7 +106,7 @@ export class Clock extends EventTarget {
     else this.play();
   }
 
-  /** Go to a time [s]; what follows the clock jumps there. */
+  /** Go to a time [s]; everything that follows the clock jumps there. */
   seek(time) {
     this.#time = Math.min(Math.max(0, time), this.duration);
     this.#tell("seek");
@@ -117,7 +117,7 @@ export class Clock extends EventTarget {
     this.seek(Math.min(Math.max(0, row), this.#frames - 1) / this.#fps);
   }
 
-  /** `count` rows on, or back; standing still. */
+  /** Pause and move by `count` rows, negative for back. */
   step(count) {
     this.pause();
     this.seekRow(this.row + count);
@@ -134,7 +134,7 @@ export class Clock extends EventTarget {
 
   #advance(by) {
     const end = this.range.to / this.#fps;
-    const over = (this.#time + by) * this.#fps + ROUNDING >= this.range.to; // as `row` counts
+    const over = (this.#time + by) * this.#fps + ROUNDING >= this.range.to; // with the same rounding as `row`
     this.#time = Math.min(this.#time + by, end);
     if (over && this.#loop) {
       this.seekRow(this.range.from);
@@ -144,7 +144,7 @@ export class Clock extends EventTarget {
     if (!over) return;
     const last = this.range.to - 1;
     this.pause();
-    this.seekRow(last); // what is shown at the end is the last row, not the one after it
+    this.seekRow(last); // the last row stays visible at the end, not the one after it
   }
 
   #tell(kind) {
@@ -153,7 +153,10 @@ export class Clock extends EventTarget {
   }
 }
 
-/** The clock of one of several episodes: the shared one, `offset` seconds later; it rests before its first and after its last row. */
+/**
+ * The clock of one of several episodes: the shared clock, `offset` seconds later. It stands still before the episode's first
+ * row and after its last.
+ */
 export class Shifted extends EventTarget {
   #clock;
   #offset;
@@ -193,7 +196,7 @@ export class Shifted extends EventTarget {
     return Math.min(this.rows - 1, Math.floor(this.time * this.fps + 1e-6));
   }
 
-  /** Whether the shared clock is where this episode has no row. */
+  /** True if the episode has no row at the time of the shared clock. */
   get resting() {
     return this.#own < -1e-6 || this.#own > this.duration - 0.5 / this.fps;
   }

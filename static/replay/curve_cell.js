@@ -1,4 +1,4 @@
-// One of the small multiples: the curves of a joint, which joint that is, and its values at the cursor.
+// One plot of the pane of curves: a joint's curves, the choice of the joint, and its values at the cursor.
 
 import { KINDS, SECOND } from "../console/curves/curve_kinds.js";
 import { jointOptions } from "../console/manual/joint_names.js";
@@ -13,13 +13,13 @@ export class CurveCell {
   #plot;
   #drawn; // {curves, raw, unit} of the joint
   #select;
-  #second; // which signal of another joint is drawn too
-  #other = null; // its values
-  #values = new Map(); // name of a curve -> where its value stands
+  #second; // choice of a signal of another joint that is drawn too
+  #other = null; // the values of that signal
+  #values = new Map(); // name of a curve -> element of its value
 
   /**
-   * Number `number` of `count`, the first with the strip of the chunks. `read(index)` gives {curves, raw, unit} of a joint;
-   * `chose()` hears that another one is drawn, `remove()` that it is not wanted any more.
+   * Plot number `number` of `count`; the first has the strip of the chunks. `read(index)` returns {curves, raw, unit} of a
+   * joint; `chose()` is called when another joint or signal is chosen, `remove()` when the plot is to be removed.
    */
   constructor({ index, number, count, read, joints, grippers, library, behind, shown, seek, hover, chose, remove }) {
     this.#read = read;
@@ -86,7 +86,7 @@ export class CurveCell {
     this.#select.focus();
   }
 
-  /** Draw its joint; it has to be on the page. */
+  /** Draw the chosen joint; the element must be on the page. */
   draw() {
     this.#drawn = this.#read(this.index);
     this.element.querySelector("[data-unit]").textContent = this.#drawn.unit;
@@ -97,7 +97,9 @@ export class CurveCell {
     this.#plot.reveal(name, shown);
   }
 
-  /** Move the line of the clock to `now`, and say the values at `time`, which is in `tick` and a step of chunk `owner`. */
+  /**
+   * Move the line of the clock to `now`, and show the values at `time`, which lies in `tick` and in a step of chunk `owner`.
+   */
   at(now, { tick, time, owner }) {
     const { curves, raw } = this.#drawn;
     this.#plot.at(now);
@@ -119,7 +121,7 @@ export class CurveCell {
   }
 }
 
-/** A group of options: `kind` of every joint. */
+/** Return a group of options: the signal `kind` of every joint. */
 function signals(kind, joints) {
   const group = document.createElement("optgroup");
   group.label = OTHERS[kind];
@@ -127,7 +129,7 @@ function signals(kind, joints) {
   return group;
 }
 
-/** What the newest chunk wants at `time`; NaN where it says nothing. */
+/** Return what the newest chunk wants at `time`; NaN if there is none. */
 function wanted(chunks, time) {
   const chunk = chunks.findLast(({ times }) => times[0] <= time);
   return chunk ? chunk.values[lastNotAbove(chunk.times, time)] : NaN;

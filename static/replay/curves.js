@@ -1,4 +1,4 @@
-// The pane of the curves: small multiples of the joints that were chosen, or move most, and what holds for all of them.
+// The pane of the curves: a plot for each of the joints that were chosen or that move most, and what applies to all of them.
 
 import { Legend } from "../console/curves/curve_legend.js";
 import { lastNotAbove } from "../site/binary_search.js";
@@ -10,10 +10,10 @@ import { movingMost } from "./moving.js";
 import { isTuningEvent } from "./plot.js";
 import { readout, write } from "./readout.js";
 
-const KEY = "eva-replay-joints"; // names, as they were chosen; without it those that move most
+const KEY = "eva-replay-joints"; // names of the chosen joints; without this key, the joints that move most are drawn
 const MULTIPLES = 4;
 
-/** Fill the pane, or put a sentence in its place; resolves to {held, marks, chunks}, empty where nothing is known. */
+/** Fill the pane, or show a sentence instead; resolve to {held, marks, chunks}, which are empty if nothing is known. */
 export async function curvePane({ clock, address, uplot }) {
   const note = document.getElementById("curves-note");
   try {
@@ -46,8 +46,8 @@ class Pane {
   #cells = [];
   #place = document.getElementById("plots");
   #legend;
-  #moving; // joints by how far they move
-  #hovered = null; // [s], null where the pointer is elsewhere
+  #moving; // joints, sorted by how far they move
+  #hovered = null; // [s]; null if the pointer is elsewhere
   #said = document.getElementById("chunk");
 
   constructor(clock, episode, library) {
@@ -68,7 +68,7 @@ class Pane {
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
   }
 
-  /** Those of this browser's choice that the episode has, else those that move most. */
+  /** Return the joints of this browser's choice that the episode has or, if there is none, those that move most. */
   #chosen() {
     const names = this.#episode.header.joints;
     const kept = JSON.parse(localStorage.getItem(KEY) ?? "[]").map((name) => names.indexOf(name));
@@ -110,7 +110,7 @@ class Pane {
     });
   }
 
-  /** One time axis below each other, also where one of them has a second axis of values. */
+  /** Align the time axes of all plots, also if one of them has a second value axis. */
   #align() {
     const some = this.#cells.some(({ second }) => second);
     for (const cell of this.#cells) cell.align(some);
@@ -167,7 +167,7 @@ class Pane {
     this.#at();
   }
 
-  /** The values and the chunk under the pointer, or else at the clock. */
+  /** Show the values and the chunk under the pointer or, without a pointer, at the clock. */
   #at() {
     const time = (this.#hovered ?? this.#clock.time) + 1e-6;
     const { chunks, ticks } = this.#episode;
@@ -178,7 +178,7 @@ class Pane {
   }
 }
 
-/** Say what a colour behind the curves means. */
+/** Add a line that explains a colour behind the curves. */
 function mark(element, name, colour, shape, means) {
   const part = document.createElement("p");
   part.className = "legend legend-mark";
@@ -189,7 +189,7 @@ function mark(element, name, colour, shape, means) {
   element.append(part);
 }
 
-/** Consecutive values of one chunk belong to one line: [{id, times, values}]. */
+/** Group consecutive values of one chunk into lines: [{id, times, values}]. */
 function answers(times, values, ids) {
   const found = [];
   ids.forEach((id, index) => {

@@ -1,9 +1,9 @@
-// The binary messages of an episode.
+// Binary messages about an episode.
 
 import { decode } from "../console/live/frame.js";
 import { sentence, t } from "../site/sentences.js";
 
-/** The message at `address`; throws with the server's sentence. */
+/** Resolve to the decoded message at `address`; throw an error with the server's sentence. */
 export async function message(address) {
   const response = await fetch(address, { credentials: "same-origin", redirect: "manual", headers: { Accept: "application/json" } });
   if (response.ok) return decode(await response.arrayBuffer());
@@ -13,7 +13,7 @@ export async function message(address) {
   throw new Error(t("page.site.http_status", "the server answered with HTTP {status}", { status: response.status }));
 }
 
-/** Joint j of an array that lies joint by joint; nothing is copied. */
+/** Return one joint of an array that is ordered joint by joint; nothing is copied. */
 export function joint(values, index, length) {
   return values.subarray(index * length, (index + 1) * length);
 }

@@ -1,4 +1,4 @@
-// The episodes that are chosen in the list go along with a deletion.
+// Adds the episodes that are chosen in the list to the form that deletes them.
 
 import { t } from "../site/sentences.js";
 
@@ -9,8 +9,8 @@ if (form) {
   const count = form.querySelector("[data-count]");
   const show = () => (count.textContent = String(chosen().length));
   document.getElementById("chosen").addEventListener("change", show);
-  document.body.addEventListener("htmx:afterSwap", show); // the list was narrowed: those that are gone are chosen no more
-  window.addEventListener("pageshow", show); // a browser that comes back fills its fields again
+  document.body.addEventListener("htmx:afterSwap", show); // a narrowed list has fewer episodes, and those that are gone are not chosen any more
+  window.addEventListener("pageshow", show); // a browser that comes back restores its fields
   form.addEventListener("submit", (event) => {
     if (!chosen().length) {
       event.preventDefault();

@@ -1,8 +1,10 @@
-// Which camera is shown large: none, all alike in a grid, or one with the others in a strip; the address says which.
+// Which camera is shown large: none (all in a grid), or one with the others in a strip; the page's address keeps it.
 
 const NAME = "camera";
 
-/** Let pictures and their names in `section` enlarge and, pressed again, put back; key v goes round all of them. */
+/**
+ * Let a press on a picture or name in `section` enlarge it, and a second press restore the grid; the key v steps through all.
+ */
 export function enlarged(section) {
   const figures = [...section.querySelectorAll(".replay-camera")];
   if (figures.length < 2) return;

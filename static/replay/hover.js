@@ -1,18 +1,18 @@
-// What lies under the pointer on the time axis, before it is gone to: the time, what happened there, small pictures.
+// Preview under the pointer on the time axis: the time, what happened there, and small pictures.
 
 import { t } from "../site/sentences.js";
 
-const HALF_THUMB = 8; // px, at both ends of a range input: where its axis begins and ends
-const NEAR = 6; // px from a mark
-const MOST = 4; // cameras; with one shown large that one first
+const HALF_THUMB = 8; // px at both ends of a range input, where its axis begins and ends
+const NEAR = 6; // distance to a mark [px]
+const MOST = 4; // cameras at most
 
-/** The row of a clock with `rows` rows at `x` [px] on an axis that is `width` wide. */
+/** Return the row at `x` [px] on an axis that is `width` px wide, of a clock with `rows` rows. */
 export function rowAt(x, width, rows) {
   const share = (x - HALF_THUMB) / Math.max(1, width - 2 * HALF_THUMB);
   return Math.min(rows - 1, Math.max(0, Math.floor(share * rows)));
 }
 
-/** Where on a sheet the picture of a row lies, as the percentages of a background's position. */
+/** Return where a row's picture lies on its sheet, as percentages for background-position. */
 export function tileAt(row, { every, across, down }) {
   const tile = Math.floor(row / every);
   const share = (at, of) => (of > 1 ? (100 * at) / (of - 1) : 0);
@@ -23,11 +23,11 @@ export class Hover {
   #clock;
   #axis;
   #box = document.getElementById("hover");
-  #sheets; // {address, picture}
+  #sheets; // {sheet: address, picture: element}
   #grid;
   #marks = [];
 
-  /** `videos` have a `sheet` each where there is one, laid out by `grid`; `stamp` writes seconds. */
+  /** Each of `videos` has a `sheet` if one exists, laid out by `grid`; `stamp` formats seconds. */
   constructor({ clock, axis, videos = [], grid = null, stamp }) {
     this.#clock = clock;
     this.#axis = axis;
@@ -39,7 +39,7 @@ export class Hover {
     for (const kind of ["pointerleave", "pointercancel"]) axis.addEventListener(kind, () => (this.#box.hidden = true));
   }
 
-  /** Say of these what is near the pointer: [{time, text}]. */
+  /** Show these marks when they are near the pointer: [{time, text}]. */
   mark(marks) {
     this.#marks = marks;
   }

@@ -1,12 +1,12 @@
-// The strip over the curves that says which chunk owns which steps, with the hairlines and bands that go with it.
+// The strip over the curves that shows which chunk owns which steps, with its hairlines and bands.
 
 import { css } from "../console/curves/curve_kinds.js";
 import { t } from "../site/sentences.js";
 
-export const LANE = 20; // px, over the plot
-const LEAST = 4; // px that a chunk takes on average, for its own tint
-const SPACED = 12; // px, for its own hairline
-const ROOM = 8; // px around a number
+export const LANE = 20; // height over the plot [px]
+const LEAST = 4; // least average width of a chunk [px] at which each has its own tint
+const SPACED = 12; // least average distance of hairlines [px] at which they are drawn
+const ROOM = 8; // space around a number [px]
 
 export class Lane {
   #chunks;
@@ -15,7 +15,7 @@ export class Lane {
     this.#chunks = chunks;
   }
 
-  /** Bands where several chunks made a step, and a hairline where another one takes over; under the curves. */
+  /** Draw under the curves: bands where several chunks contributed, and a hairline where another chunk takes over. */
   behind(ctx, x, { top, height, width }) {
     ctx.fillStyle = css("--mark-overlap");
     for (const [from, to] of this.#chunks.overlaps) ctx.fillRect(x(from), top, Math.max(1, x(to) - x(from)), height);
@@ -27,7 +27,7 @@ export class Lane {
     ctx.globalAlpha = 1;
   }
 
-  /** The strip itself, from `top` on; `chosen` is the chunk under the cursor. */
+  /** Draw the strip itself from `top` on; `chosen` is the chunk under the cursor. */
   strip(ctx, x, { left, top, width, chosen }) {
     const tall = (LANE - 4) * devicePixelRatio;
     const seen = this.#visible(x, width);
@@ -38,7 +38,7 @@ export class Lane {
     if (!seen.legible) this.#summary(ctx, t("page.replay.many_chunks", "{n} chunks: drag over the curves to look closer", { n: seen.count }), { left, top, width, tall });
   }
 
-  /** The spans in sight, in which every second owner is `odd`; whether each has room. */
+  /** Return the spans in view, every second one marked as `odd`, and whether there is room for them (`legible`). */
   #visible(x, width) {
     const spans = this.#chunks.spans
       .map((span, index) => ({ ...span, odd: index % 2 === 1 }))

@@ -1,4 +1,4 @@
-// Which cameras show another picture than the one of the row, said where the picture is: it was given, and is not in the video.
+// Says in the picture of a camera that it is not the picture of the row, because that is missing from the video.
 
 import { t } from "../site/sentences.js";
 
@@ -7,13 +7,13 @@ const WORDS = {
   video_lost: ({ first }) => (first > 0 ? t("page.replay.video_ended", "ended at row {row}", { row: first }) : t("page.replay.no_video", "no video")),
 };
 
-/** What is to be said of a camera at a row by the flags of the checks; "" where its picture is that of the row. */
+/** Return what to say about a camera at a row, from the flags of the checks; "" if its picture is that of the row. */
 export function lostFrameText(flags, camera, row) {
   const flag = flags.find(({ kind, stream, first, last }) => kind in WORDS && stream === camera && first <= row && row <= last);
   return flag ? WORDS[flag.kind](flag) : "";
 }
 
-/** Say it beside the names of the cameras on the page. */
+/** Show these texts beside the names of the cameras on the page. */
 export function showLostFrames(flags, row) {
   for (const picture of document.querySelectorAll("[data-camera]")) {
     const words = lostFrameText(flags, picture.dataset.camera, row);

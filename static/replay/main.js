@@ -1,4 +1,4 @@
-// The page of one episode: cameras, robot and curves on one clock. Pictures come first, what is drawn after them.
+// The page of one episode: cameras, robot and curves on one clock. The pictures are loaded first, robot and curves after them.
 
 import { t } from "../site/sentences.js";
 import { cameras, firstPictures } from "./cameras.js";
@@ -13,7 +13,7 @@ const config = JSON.parse(document.getElementById("config").textContent);
 const clock = new Clock(config);
 const timeline = new Timeline(clock, { videos: config.videos, grid: config.grid });
 
-/** Say in a pane's note why its scripts are not there. */
+/** Show in a pane's note why its scripts could not be loaded. */
 function absent(note, error) {
   document.getElementById(note).textContent = t("page.replay.not_loaded", "The scripts of this pane did not load: {why}. Load the page again.", { why: error.message });
   console.error(error);

@@ -1,8 +1,11 @@
-// Which joints move most: what an episode is about is seen in them.
+// Which joints move most; these show best what happens in an episode.
 
-const AS_FAR = { m: 10 }; // of a joint of that unit one counts as so many radians: a gripper that closes is a motion
+const AS_FAR = { m: 10 }; // how many radians one unit of a joint counts as, so that closing a gripper counts as a motion
 
-/** The joints of `count` [indices], those that move farthest first; `values` lie joint by joint, `units` say of what. */
+/**
+ * Return the indices of the `count` joints, those that move farthest first. `values` are ordered joint by joint; `units` are
+ * the joints' units.
+ */
 export function movingMost(values, count, units) {
   const length = values.length / count;
   const moved = Array.from({ length: count }, (_, index) => {

@@ -1,4 +1,4 @@
-// The curves of one joint over the whole episode, with what happened drawn behind and over them.
+// The curves of one joint over the whole episode, with marks of what happened behind and over them.
 
 import { AXIS, KINDS, SECOND, axes, blank, css, series, spread } from "../console/curves/curve_kinds.js";
 import { LANE, Lane } from "./lane.js";
@@ -7,9 +7,9 @@ const LINES = KINDS.filter((kind) => kind.name !== "raw"); // raw is drawn chunk
 const RAW = KINDS.find((kind) => kind.name === "raw");
 const SAFETY_HEIGHT = 5; // px
 const EVENT_HEIGHT = 7; // px
-const FAINT = 0.6; // of what the chunks wanted that are not under the cursor
+const FAINT = 0.6; // opacity of the answers of chunks that are not under the cursor
 
-/** Whether an event of that kind is another strategy, or other parameters of it. */
+/** Return whether an event of that kind marks another strategy, or other parameters of it. */
 export function isTuningEvent(kind) {
   return kind === "tuned" || kind === "tuned_to";
 }
@@ -26,14 +26,17 @@ export class Plot {
   #behind; // {held, marks, safety, owners}
   #raw = [];
   #second = null; // values of another signal, on the axis at the right
-  #aligned = false; // with a plot that has such an axis
+  #aligned = false; // true if another plot has an axis at the right
   #time = 0;
   #shown;
   #lane;
   #chosen = -1; // the chunk under the cursor
   #hover;
 
-  /** `strip`: whether it has the strip of the chunks and the words of the time axis, which several below each other share. */
+  /**
+   * `strip` says whether the plot has the strip of the chunks and the labels of the time axis; plots below each other share
+   * these.
+   */
   constructor({ element, library, behind, strip, shown, seek, hover }) {
     this.#element = element;
     this.#library = library;
@@ -55,7 +58,7 @@ export class Plot {
     this.#plot?.destroy();
   }
 
-  /** `curves`: {time, state, executed, smoothed} of one joint; `raw`: [{id, times, values}] as the policy gave them. */
+  /** Draw `curves` {time, state, executed, smoothed} of one joint and `raw` [{id, times, values}], as the policy gave them. */
   show(curves, raw) {
     this.#raw = raw;
     this.#data = [Array.from(curves.time), ...LINES.map((kind) => blank(curves[kind.name]))];
@@ -64,13 +67,13 @@ export class Plot {
     this.at(this.#time);
   }
 
-  /** Draw another signal over the same time, or none: null. */
+  /** Draw another signal over the same time; null draws none. */
   beside(values) {
     this.#second = values && blank(values);
     this.#build();
   }
 
-  /** Leave as much room at the right as those that have an axis there. */
+  /** Leave as much space at the right as a plot with an axis there. */
   align(on) {
     if (on === this.#aligned) return;
     this.#aligned = on;
@@ -81,13 +84,13 @@ export class Plot {
     return this.#second ? [...this.#data, this.#second] : this.#data;
   }
 
-  /** Draw the curve of that name, or leave it out. */
+  /** Show or hide the curve of that name. */
   reveal(name, shown) {
     if (name === RAW.name) this.#plot?.redraw();
     else this.#plot?.setSeries(1 + LINES.findIndex((kind) => kind.name === name), { show: shown });
   }
 
-  /** Move the line of the clock. */
+  /** Move the line of the clock to `time` [s]. */
   at(time) {
     this.#time = time;
     if (!this.#plot) return;
@@ -96,7 +99,7 @@ export class Plot {
     this.#cursor.style.transform = `translateX(${left}px)`;
   }
 
-  /** Bring out the chunk of that number. */
+  /** Highlight the chunk with that number. */
   choose(id) {
     if (id === this.#chosen) return;
     this.#chosen = id;
@@ -146,7 +149,7 @@ export class Plot {
     return this.#second ? [...own, { label: "second", scale: "second", stroke: css(colour), width, dash, points: { show: false } }] : own;
   }
 
-  /** A click goes there; a drag looks closer, a double click at everything. */
+  /** Let a click move the clock. A drag, which zooms in, does not; a double click zooms out again. */
   #pick(plot) {
     let pressed = null;
     plot.over.addEventListener("pointerdown", (event) => (pressed = event.clientX));
@@ -157,7 +160,10 @@ export class Plot {
     });
   }
 
-  /** Draw within the plot, `above` it by so many pixels; `x(time)` knows where the plot begins and ends. */
+  /**
+   * Draw inside the plot and `above` device pixels above it; `x(time)` converts times, and x.left and x.right are the plot's
+   * edges.
+   */
   #inside(plot, draw, above = 0) {
     const { left, top, width, height } = plot.bbox;
     const x = Object.assign((time) => plot.valToPos(time, "x", true), { left, right: left + width });
@@ -187,7 +193,7 @@ export class Plot {
     this.#inside(plot, (ctx, x, place) => this.#lane.strip(ctx, x, { ...place, chosen: this.#chosen }), above);
   }
 
-  /** What each chunk wanted, the one under the cursor on top. */
+  /** Draw what each chunk wanted, with the one under the cursor on top. */
   #drawRaw(plot, ctx, x) {
     const own = ({ id }) => id === this.#chosen;
     const raw = this.#raw;

@@ -1,12 +1,12 @@
-// One line about the chunk under the cursor: whose step it is, how late its chunk came, what else made it.
+// One line about the chunk under the cursor: whose step it is, how late the chunk came, which chunks contributed.
 
 import { t } from "../site/sentences.js";
 
-const NAMED = 3; // of the chunks that made a step
+const NAMED = 3; // chunks named at most as contributors to a step
 const percent = (weight) => `${Math.round(100 * weight)} %`;
 const steps = (n) => (n === 1 ? t("page.readout.step", "1 step") : t("page.readout.steps", "{n} steps", { n }));
 
-/** Sentences about the step at `time`: [{text, warn}], the most important first. */
+/** Return sentences about the step at `time` as [{text, strong, warn}], the most important first. */
 export function readout(chunks, time) {
   const id = chunks.ownerAt(time);
   if (id < 0) return [{ text: t("page.readout.none", "no policy output at this step") }];

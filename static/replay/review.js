@@ -1,4 +1,4 @@
-// The review of an episode: what the checks found, verdicts, annotated parts; everything has a key.
+// The review of an episode: findings of the checks, verdicts and annotated segments, all with keys.
 
 import { get, post } from "../site/api.js";
 import { t } from "../site/sentences.js";
@@ -7,8 +7,8 @@ import { Annotation } from "./annotation.js";
 import { showLostFrames } from "./lost_frames.js";
 import { drawBands, nextFlag, flagsAt, fillList, span, verdictWord } from "./review_lanes.js";
 
-const NOTE_S = 2; // a note is shown from its moment on
-const LOOK_AGAIN_MS = 4000; // while the checks are not done
+const NOTE_S = 2; // how long a note is shown after its moment [s]
+const LOOK_AGAIN_MS = 4000; // interval [ms] of new requests while the checks are not done
 const element = (id) => document.getElementById(id);
 
 export class Review {
@@ -17,9 +17,9 @@ export class Review {
   #said = { flags: [], segments: [], reviews: [], covered: 0, quality: null, verdict: null };
   #noted = 0; // the row at which a note was begun
   #annotation;
-  #asked = Promise.resolve(); // what was pressed, one after the other
-  #shown = 0; // answers to what was pressed
-  #leaving = false; // for the next episode: what is pressed now is meant for that one
+  #asked = Promise.resolve(); // requests of the user, one after the other
+  #shown = 0; // number of answers to the user's requests
+  #leaving = false; // true while the next episode is being opened: keys pressed now are meant for that one
 
   constructor(clock) {
     this.#clock = clock;
@@ -37,7 +37,7 @@ export class Review {
     });
     document.addEventListener("keydown", (event) => this.#key(event));
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
-    window.addEventListener("pageshow", () => (this.#leaving = false)); // somebody came back
+    window.addEventListener("pageshow", () => (this.#leaving = false)); // the user came back with the browser's Back button
     this.#load().then(() => this.#tellWaiting());
   }
 
@@ -45,14 +45,17 @@ export class Review {
     const shown = this.#shown;
     try {
       const said = await get(this.#bar.dataset.address);
-      if (shown === this.#shown) this.#show(said); // else what was pressed meanwhile has been answered, and is newer
+      if (shown === this.#shown) this.#show(said); // otherwise a request of the user was answered meanwhile, and is newer
     } catch (error) {
       this.#tell(error.message, true);
     }
     if (!this.#said.quality) setTimeout(() => this.#load(), LOOK_AGAIN_MS);
   }
 
-  /** Show what a request answers, after those before it; its failure is said, and nothing else changes. */
+  /**
+   * Send a request after all earlier ones and show its answer; a failure is reported and changes nothing else. Resolve to
+   * whether it succeeded.
+   */
   #ask(request, done = "") {
     const answer = this.#asked.then(async () => {
       try {
@@ -128,7 +131,7 @@ export class Review {
     return [...flags, ...unchecked];
   }
 
-  /** Those of one moment, in order. */
+  /** Notes about one moment, in order. */
   get #notes() {
     return this.#said.reviews.filter(({ frame }) => frame !== null).sort((one, other) => one.frame - other.frame);
   }
@@ -141,7 +144,7 @@ export class Review {
     return Number(this.#bar.dataset.frames);
   }
 
-  /** The words beside the buttons that belong to the row that is shown. */
+  /** Update the texts beside the buttons for the row that is shown. */
   #at() {
     const row = this.#clock.row;
     const [flag] = flagsAt(this.#said.flags, row);
@@ -216,7 +219,7 @@ export class Review {
     }
   }
 
-  /** To the next episode once everything that was pressed has its answer, as fast as this one is played. */
+  /** Open the next episode, with the same speed, as soon as all requests are answered. */
   async #next() {
     if (this.#leaving) return;
     this.#leaving = true;

@@ -1,10 +1,12 @@
-// Flags and segments as bands under the time axis, and as lists that lead to their frames.
+// Flags and segments as bands under the time axis, and as lists that lead to their rows.
 
 import { t } from "../site/sentences.js";
 
 const RANK = { error: 0, warning: 1, info: 2 };
 
-/** Bands of `items` ({first, last, ...}) in a strip; `dress` gives each its look. One about no frame has none. */
+/**
+ * Draw bands for `items` ({first, last, ...}) in a strip; `dress(band, item)` styles each. An item about no row has no band.
+ */
 export function drawBands(strip, items, frames, dress) {
   strip.replaceChildren(
     ...items
@@ -20,7 +22,7 @@ export function drawBands(strip, items, frames, dress) {
   );
 }
 
-/** Rows of a segment's lanes: those that overlap lie below each other. */
+/** Give each segment a `lane`, so that segments that overlap lie below each other. */
 export function stackLanes(segments) {
   const ends = [];
   return segments.map((segment) => {
@@ -31,19 +33,19 @@ export function stackLanes(segments) {
   });
 }
 
-/** The flags in a row, the worst first. */
+/** Return the flags at a row, the worst first. */
 export function flagsAt(flags, row) {
   return flags.filter(({ first, last }) => first <= row && row <= last && first >= 0).sort((one, other) => RANK[one.severity] - RANK[other.severity]);
 }
 
-/** Where the next flag begins after `row`, or the one before it; none: null. */
+/** Return where the next flag begins after `row` or, for a negative `step`, the last one before it; null if there is none. */
 export function nextFlag(flags, row, step) {
   const starts = [...new Set(flags.map(({ first }) => first))].filter((first) => first >= 0 && (step > 0 ? first > row : first < row));
   if (!starts.length) return null;
   return step > 0 ? Math.min(...starts) : Math.max(...starts);
 }
 
-/** A list in place of what it had; each item is { words, detail, mark, go }, `none` is said where there is none. */
+/** Replace a list's content by `items` of {words, detail, mark, go}, or by the text `none` if there are none. */
 export function fillList(element, items, none) {
   const made = items.map(({ words, detail, mark, go }) => {
     const item = document.createElement("li");
@@ -60,19 +62,19 @@ export function fillList(element, items, none) {
   element.replaceChildren(...made);
 }
 
-/** Which rows a segment is, what it ends with, and whose it is. */
+/** Return in words which rows a segment covers, which milestone it ends with, and whose it is. */
 export function span({ first, last, milestone }, who) {
   if (milestone) return t("page.review.span_then", "{first} to {last}, then {milestone}, {who}", { first, last, milestone, who });
   return t("page.review.span", "{first} to {last}, {who}", { first, last, who });
 }
 
-/** What a verdict is called. */
+/** Return the name of a verdict. */
 export function verdictWord(verdict) {
   const words = { pass: t("page.review.pass", "pass"), fail: t("page.review.fail", "fail"), note: t("page.review.note", "note") };
   return words[verdict] ?? verdict;
 }
 
-/** Where several of the segments lie over each other: [{first, last, count}]. */
+/** Return where several segments overlap: [{first, last, count}]. */
 export function overlaps(segments) {
   const edges = segments.flatMap(({ first, last }) => [
     [first, 1],

@@ -1,4 +1,4 @@
-// The robot in 3D on the clock: poses come in parts of some hundred rows, when they are needed.
+// The robot in 3D on the clock; poses are fetched in parts of some hundred rows when they are needed.
 
 import { get } from "../site/api.js";
 import { t } from "../site/sentences.js";
@@ -13,9 +13,9 @@ export class Robot {
   #scene;
   #clock;
   #address;
-  #part = 0; // rows of an answer
+  #part = 0; // rows per answer
   #parts = new Map(); // first row -> promise of its numbers
-  #size = 0; // numbers of a row
+  #size = 0; // numbers per row
   #shown = -1;
 
   constructor({ scene, clock, address, size }) {
@@ -26,7 +26,7 @@ export class Robot {
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#show());
   }
 
-  /** Fetch the first rows; throws where the robot cannot be placed. */
+  /** Fetch the first rows and show the robot; throw if it cannot be placed. */
   async begin() {
     const numbers = await this.#fetch(0);
     this.#part = numbers.length / this.#size;
@@ -55,14 +55,14 @@ export class Robot {
     const next = first + this.#part;
     if (next < rows && row - first > this.#part / 2) this.#rows(next);
     const numbers = await this.#rows(first);
-    if (row !== this.#clock.row) return; // the clock has gone on meanwhile
+    if (row !== this.#clock.row) return; // the clock has moved on meanwhile
     this.#shown = row;
     const from = (row - first) * this.#size;
     this.#scene.setPoses(numbers.subarray(from, from + this.#size), 1);
   }
 }
 
-/** Fill the pane in `root`, or put a sentence in its place; without an address that is `why`. */
+/** Fill the pane in `root`, or show a sentence instead; `why` is the reason if there is no address. */
 export async function robotPane({ root, clock, viewer, geometry: address, poses, bench = "", why = t("page.replay.no_robot", "the episode names no robot") }) {
   const note = root.querySelector("[data-scene-note]");
   if (!address) {
@@ -73,7 +73,7 @@ export async function robotPane({ root, clock, viewer, geometry: address, poses,
     const [geometry] = await Promise.all([get(address), loaded(viewer)]);
     const scene = new Scene3D(root.querySelector("[data-scene]"));
     scene.show(geometry);
-    scene.toggle("path"); // a path that jumps with the clock would be none
+    scene.toggle("path"); // a path would show jumps of the clock as motion
     for (const button of root.querySelectorAll("[data-view]")) {
       button.addEventListener("click", () => scene.view(button.dataset.view));
     }

@@ -1,4 +1,4 @@
-// Whose numbers an episode has is said anew: the page is shown with that robot.
+// The choice of the robot that an episode is of: the page is loaded again with that robot.
 
 const select = document.getElementById("robot");
 select.addEventListener("change", () => {

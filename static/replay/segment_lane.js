@@ -1,12 +1,13 @@
-// The lane of the segments under the time axis: bands of their label's colour, those that overlap below each other.
-// On the empty lane a drag draws one; the ends of one's own are moved by a drag, or by arrow keys while they have the focus.
+// The lane of the segments under the time axis: bands in the colours of their labels, with those that overlap below each other.
+// A drag on the empty lane draws a segment. The ends of the user's own segments are moved by a drag, or by arrow keys while
+// they have the focus.
 
 import { t } from "../site/sentences.js";
 import { overlaps, stackLanes } from "./review_lanes.js";
 
-const SETTLED_MS = 700; // after the last arrow key an end is where it was meant to be
+const SETTLED_MS = 700; // time [ms] after the last arrow key until the new end is saved
 
-/** The row at `x` [px] of a lane that is `width` wide. */
+/** Return the row at `x` [px] on a lane that is `width` px wide. */
 export function rowOn(x, width, rows) {
   return Math.min(rows - 1, Math.max(0, Math.floor((x / Math.max(1, width)) * rows)));
 }
@@ -19,10 +20,13 @@ export class SegmentLane {
   #moved;
   #segments = [];
   #colours = new Map();
-  #open = document.createElement("i"); // the one that has no end yet
+  #open = document.createElement("i"); // band of the segment that has no end yet
   #moving = null; // {segment, end, band, waiting}
 
-  /** `drawn({first, last})` hears of a new one; `moved(segment)` of one of `user` with another end, and resolves when it is kept. */
+  /**
+   * `drawn({first, last})` is called with a new segment. `moved(segment)` is called with a segment of `user` whose end was
+   * moved, and resolves when it is saved.
+   */
   constructor({ strip, clock, user = "", drawn = null, moved = null }) {
     this.#strip = strip;
     this.#clock = clock;
@@ -34,14 +38,14 @@ export class SegmentLane {
     if (drawn) strip.addEventListener("pointerdown", (event) => event.target === strip && event.button === 0 && this.#draw(event));
   }
 
-  /** Show them, [{uuid, first, last, label, milestone, annotator}]; `colours` by label. */
+  /** Show segments [{uuid, first, last, label, milestone, annotator}]; `colours` maps labels to colours. */
   show(segments, colours = this.#colours) {
     this.#segments = segments;
     this.#colours = colours;
     if (!this.#moving) this.#render();
   }
 
-  /** Show one that has no end yet; null: none. */
+  /** Show the segment that has no end yet; null shows none. */
   open(span) {
     this.#open.remove();
     if (!span) return;
@@ -95,7 +99,7 @@ export class SegmentLane {
     return band;
   }
 
-  /** What moves one end of it. */
+  /** Return the handle that moves one end of a segment. */
   #end(segment, end, band) {
     const handle = document.createElement("i");
     handle.className = "segment-end";
@@ -123,7 +127,7 @@ export class SegmentLane {
     return rowOn(clientX - left, width, this.#clock.rows);
   }
 
-  /** Put an end to a row, as far as the other one allows; the picture of that row is shown. */
+  /** Move an end to a row, not beyond the other end, and show the picture of that row. */
   #to(row, handle, { segment, end, band }) {
     const { rows } = this.#clock;
     segment[end] = end === "first" ? Math.min(Math.max(0, row), segment.last) : Math.max(Math.min(rows - 1, row), segment.first);
@@ -135,7 +139,7 @@ export class SegmentLane {
 
   #drag(event, handle, move) {
     if (event.button !== 0) return;
-    event.preventDefault(); // it gets no focus: arrow keys go on moving the clock
+    event.preventDefault(); // keeps the focus away, so that arrow keys still move the clock
     this.#settle();
     this.#moving = move;
     handle.setPointerCapture(event.pointerId);
@@ -161,7 +165,7 @@ export class SegmentLane {
     const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
     if (!way) return;
     event.preventDefault();
-    event.stopPropagation(); // the page's own arrows move the clock
+    event.stopPropagation(); // the arrow keys of the page move the clock
     clearTimeout(move.waiting);
     this.#moving = move;
     this.#to(move.segment[move.end] + way * (event.shiftKey ? Math.round(this.#clock.fps) : 1), handle, move);
@@ -172,14 +176,14 @@ export class SegmentLane {
     if (this.#moving?.waiting) this.#leave(this.#moving, true);
   }
 
-  /** Keep what was moved, or show what was there before. */
+  /** Save what was moved, or restore the previous state. */
   async #leave(move, keep) {
     clearTimeout(move.waiting);
     move.waiting = null;
     const before = this.#segments.find(({ uuid }) => uuid === move.segment.uuid);
     const changed = before && (before.first !== move.segment.first || before.last !== move.segment.last);
     if (keep && changed) await this.#moved(move.segment);
-    if (move.waiting) return; // an arrow key was pressed meanwhile: it is kept next
+    if (move.waiting) return; // an arrow key was pressed meanwhile: its change is saved next
     if (this.#moving === move) this.#moving = null;
     if (!this.#moving) this.#render();
   }

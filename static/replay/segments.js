@@ -1,4 +1,4 @@
-// Annotations and verdicts that came along with an episode of a dataset: to be seen, not to be changed here.
+// Segments and verdicts that belong to an episode of a dataset; here they are only shown.
 
 import { get } from "../site/api.js";
 import { t } from "../site/sentences.js";
@@ -6,7 +6,7 @@ import { when } from "../site/times.js";
 import { fillList, span, verdictWord } from "./review_lanes.js";
 import { SegmentLane } from "./segment_lane.js";
 
-/** Fetch what lies beside the episode and show it under the time axis and in a list. */
+/** Fetch the annotations of the episode, and show them under the time axis and in lists. */
 export async function showRecordedSegments(clock, address) {
   const strip = document.getElementById("segments");
   const count = document.getElementById("segments-count");

@@ -1,4 +1,4 @@
-// The curves of one joint of one or several episodes: state drawn through, executed dashed, a colour for each episode.
+// The curves of one joint in one or several episodes: state as a solid line, executed action dashed, one colour per episode.
 
 import { axes, css, spread } from "../console/curves/curve_kinds.js";
 
@@ -8,7 +8,10 @@ export class SharedPlot {
   #cursor = document.createElement("i");
   #sized;
 
-  /** `lines`: [{number, state, executed}] at `time`; `all` those of the other plots too, for the range of values. */
+  /**
+   * `lines` are [{number, state, executed}] at `time`; `all` includes the lines of the other plots, for a common range of
+   * values.
+   */
   constructor({ element, library, time, lines, all, seek }) {
     this.#element = element;
     this.#cursor.className = "replay-cursor";
@@ -35,7 +38,7 @@ export class SharedPlot {
     this.#sized.observe(element);
   }
 
-  /** Move the line of the clock. */
+  /** Move the line of the clock to `time` [s]. */
   at(time) {
     const left = this.#plot.valToPos(time, "x");
     this.#cursor.hidden = left < 0 || left > this.#plot.over.clientWidth;

@@ -1,4 +1,4 @@
-// Several episodes on one clock: cameras of each in a column, curves of one joint over each other or below each.
+// Several episodes on one clock: the cameras of each in a column, the curves of one joint in one plot or one below each column.
 
 import { jointOptions } from "../console/manual/joint_names.js";
 import { t } from "../site/sentences.js";
@@ -20,7 +20,7 @@ const clock = new Clock(shared);
 const timeline = new Timeline(clock);
 const element = (id) => document.getElementById(id);
 
-/** The page again, with another word in its address. */
+/** Load the page again with another parameter in its address. */
 function again(name, value) {
   const address = new URL(window.location.href);
   if (value) address.searchParams.set(name, value);
@@ -60,8 +60,8 @@ if (scenes) {
   });
 }
 
-const KEY = `eva-beside-joint:${given.getAll("show").join()}`; // of these episodes, while the tab is open
-const SAMPLES = 400; // times at which episodes are held against each other
+const KEY = `eva-beside-joint:${given.getAll("show").join()}`; // key of the joint chosen for these episodes, kept while the tab is open
+const SAMPLES = 400; // number of times at which the episodes are compared
 
 async function curves() {
   const library = (await import(config.uplot).catch(() => null))?.default;
@@ -92,7 +92,7 @@ async function curves() {
   show();
 }
 
-/** One plot of all, or one below each; all with the same range of values. */
+/** One plot of all episodes, or one below each; all with the same range of values. */
 class Plots {
   #library;
   #time;

@@ -1,11 +1,12 @@
-// Cameras whose pictures lie one by one in a column: the newest that has come is shown, and the next is asked for then.
+// Cameras whose pictures are single images of a dataset's column: the next picture is requested when the previous one has
+// arrived.
 
 import { t } from "../site/sentences.js";
 
 export class Stills {
   #clock;
 
-  /** `pictures`: [{element, address}] of images. */
+  /** `pictures` are [{element, address}], with image elements. */
   constructor(pictures, clock) {
     this.#clock = clock;
     for (const picture of pictures) {

@@ -1,4 +1,4 @@
-// The tags of an episode: each leads to the episodes that have it; one is typed in, one is taken off.
+// The tags of an episode: each is a link to the episodes that have it; a field adds one, a button removes one.
 
 import { post, RequestFailed } from "../site/api.js";
 import { t } from "../site/sentences.js";

@@ -1,4 +1,4 @@
-// The time axis of the transport, with held spans shaded, events, milestones and chunks marked, and the list of events.
+// The time axis with held spans, events, milestones and chunks, and the list of events.
 
 import { t } from "../site/sentences.js";
 import { Hover } from "./hover.js";
@@ -15,7 +15,7 @@ export class Timeline {
   #now = -1;
   #hover;
 
-  /** `pictures`: {videos, grid} of the small pictures, where there are any. */
+  /** `pictures` is {videos, grid} for the small pictures, if there are any. */
   constructor(clock, pictures = {}) {
     this.#clock = clock;
     this.#hover = new Hover({ clock, axis: this.#scrub, stamp, ...pictures });
@@ -26,7 +26,7 @@ export class Timeline {
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
   }
 
-  /** `held`: [[from, to]], `marks`: [{time, kind, text}] and `chunks`: [{from}], in seconds. */
+  /** Show `held` [[from, to]], `marks` [{time, kind, text}] and `chunks` [{from}], in seconds. */
   fill({ held, marks, chunks = [] }) {
     const strip = document.getElementById("marks");
     const share = (time) => `${(100 * Math.min(time, this.#clock.duration)) / this.#clock.duration}%`;
@@ -42,7 +42,7 @@ export class Timeline {
     this.#at();
   }
 
-  /** A hairline where each chunk takes over. */
+  /** Draw a hairline where each chunk takes over. */
   #chunks(chunks) {
     const lane = document.getElementById("chunks");
     const places = chunks.map(({ from }) => Math.min(from, this.#clock.duration) / this.#clock.duration);

@@ -1,11 +1,11 @@
-// Buttons and keys of the playback. Space plays here: this page is bound to no station.
+// Buttons and keys of the playback. Space plays and is no e-stop, because this page belongs to no station.
 
 import { t } from "../site/sentences.js";
 import { syncWithUrl } from "./url_state.js";
 
 const SECOND_KEYS = { ArrowLeft: -1, ArrowRight: 1 };
 
-/** Let buttons and keys move the clock, and the address say where it is. */
+/** Let buttons and keys control the clock, and keep its state in the page's address. */
 export function transport(clock) {
   const play = document.getElementById("play");
   const speed = document.getElementById("speed");
@@ -25,14 +25,14 @@ export function transport(clock) {
   syncWithUrl(clock, (wanted) => choose(speed, wanted));
 }
 
-/** The nearest of the speeds there are. */
+/** Choose the nearest available speed. */
 function choose(speed, wanted) {
   const away = [...speed.options].map(({ value }) => Math.abs(Number(value) - wanted));
   speed.selectedIndex = away.indexOf(Math.min(...away));
   speed.dispatchEvent(new Event("change"));
 }
 
-/** The part that is played: its band on the time axis, and its buttons. */
+/** Show the part that is played as a band on the time axis, and handle its buttons. */
 function rangeControls(clock) {
   const band = document.getElementById("range");
   const loop = document.getElementById("loop");
@@ -55,7 +55,7 @@ function rangeControls(clock) {
   show();
 }
 
-/** The part begins here; where that is behind its end, it ends with the episode. */
+/** Let the part begin at this row; if its end is not later, it then ends with the episode. */
 function begin(clock) {
   const { to } = clock.range;
   clock.narrow({ from: clock.row, to: to > clock.row ? to : clock.rows });

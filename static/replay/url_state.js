@@ -1,9 +1,12 @@
-// What an address says of the playback: the time, the part that is played, the speed. Reload and share work.
+// The state of the playback in the page's address: time, part that is played, speed. It survives a reload and can be shared.
 
-const WAIT_MS = 250; // between two changes of the address: browsers allow only so many
+const WAIT_MS = 250; // time between two changes of the address [ms]; browsers limit their number
 const OWN = ["t", "from", "to", "loop", "speed"];
 
-/** The state in the search part of an address: {row, range: {from, to} or null, loop, speed}; null for what it does not say. */
+/**
+ * Parse the search part of an address into {row, range: {from, to} or null, loop, speed}; row and speed are null if they are
+ * missing.
+ */
 export function parseSearch(search, fps) {
   const given = new URLSearchParams(search);
   const number = (name) => (given.get(name) === null || given.get(name).trim() === "" || !Number.isFinite(Number(given.get(name))) ? null : Number(given.get(name)));
@@ -13,7 +16,7 @@ export function parseSearch(search, fps) {
   return { row: time === null ? null : row(time), range, loop: given.get("loop") === "1", speed: number("speed") };
 }
 
-/** The search part that says `state` and all else that `search` says. */
+/** Return the search part with `state` and all other parameters of `search`. */
 export function toSearch(search, { row, range, loop, speed }, fps) {
   const said = new URLSearchParams(search);
   for (const name of OWN) said.delete(name);
@@ -28,7 +31,7 @@ export function toSearch(search, { row, range, loop, speed }, fps) {
   return said.size ? `?${said}` : "";
 }
 
-/** Do what the address says, and let it say from then on what is done. */
+/** Apply the state in the address, and keep the address up to date from then on; `choose(speed)` sets the speed. */
 export function syncWithUrl(clock, choose) {
   const { row, range, loop, speed } = parseSearch(window.location.search, clock.fps);
   if (speed !== null) choose(speed);

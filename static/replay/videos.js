@@ -1,20 +1,20 @@
-// Any number of videos that follow the clock. Row k is shown from start + k / fps to start + (k + 1) / fps, where `start`
-// is that of the episode in a file that may hold many.
+// Videos that follow the clock. Row k is shown from start + k / fps to start + (k + 1) / fps, where `start` is the start of the
+// episode in its video file, which may hold several episodes.
 
 import { t } from "../site/sentences.js";
 
-const NEAR_S = 0.02; // closer than a person sees
-const BEHIND_S = 0.06; // beyond it the clock waits for the video
-const FAR_S = 0.3; // beyond it a jump is quicker than catching up
-const CATCH_UP = 0.12; // share of the rate by which a video that is off runs faster or slower
+const NEAR_S = 0.02; // smaller differences are not visible
+const BEHIND_S = 0.06; // delay of a video beyond which the clock waits for it
+const FAR_S = 0.3; // difference beyond which a jump is quicker than catching up
+const CATCH_UP = 0.12; // share of the rate by which a video that is ahead or behind plays slower or faster
 const CHECK_MS = 200;
-const AGAIN_MS = 60000; // after which a video that failed is asked for once more: its address may have run out
+const AGAIN_MS = 60000; // time after which a video that fails is requested once more: its address may have expired
 
 export class Videos {
   #clock;
   #videos = [];
 
-  /** `videos`: [{element, address, start}]. */
+  /** `videos` are [{element, address, start}]. */
   constructor(videos, clock) {
     this.#clock = clock;
     for (const { element, address, start = 0 } of videos) this.#add(element, address, start);
@@ -31,7 +31,7 @@ export class Videos {
     const broken = () => {
       if (performance.now() - video.asked > AGAIN_MS) {
         video.asked = performance.now();
-        element.load(); // our own address leads to a new one of the store
+        element.load(); // our own address redirects to a new address of the store
         return;
       }
       video.broken = true;
@@ -40,7 +40,7 @@ export class Videos {
     element.addEventListener("error", broken);
     element.addEventListener("loadedmetadata", () => this.#place(video));
     if (element.getAttribute("src") !== address) element.src = address;
-    else if (element.error) broken(); // the page asked for it before this script was here
+    else if (element.error) broken(); // the page requested it before this script ran
     else if (element.readyState >= HTMLMediaElement.HAVE_METADATA) this.#place(video);
     this.#videos.push(video);
   }
@@ -49,7 +49,7 @@ export class Videos {
     return this.#videos.filter((video) => !video.broken);
   }
 
-  /** Whether all show what the clock says and have the pictures that come next. */
+  /** Return whether all videos show the clock's row and have their next pictures. */
   #playable() {
     const { duration, fps, time } = this.#clock;
     return this.#whole.every(({ element, start }) => {
@@ -77,11 +77,14 @@ export class Videos {
     for (const video of this.#whole) this.#place(video);
   }
 
-  /** In the middle of the row's picture, so that no rounding shows a neighbour. */
+  /**
+   * Move a paused video to the middle of its row, so that no rounding shows a neighbouring picture; a playing one to the
+   * clock's time.
+   */
   #place({ element, start }) {
     const clock = this.#clock;
     const wanted = start + (clock.playing ? clock.time : (clock.row + 0.5) / clock.fps);
-    const begins = element.currentTime === 0 && wanted < 1 / clock.fps; // its first picture is there without a seek
+    const begins = element.currentTime === 0 && wanted < 1 / clock.fps; // the first picture is shown without a seek
     if (!begins && Math.abs(element.currentTime - wanted) > 1e-4) element.currentTime = wanted;
   }
 

@@ -1,10 +1,10 @@
-// The viewer script of meshcat, nearly a megabyte: fetched when something is to be drawn in 3D, once.
+// The viewer script of meshcat, nearly a megabyte: loaded once, when something is first drawn in 3D.
 
 import { t } from "../site/sentences.js";
 
 let coming = null;
 
-/** Resolves when it is there; rejects where it cannot be had. */
+/** Resolve when the script has been loaded; reject if it cannot be loaded. */
 export function viewer(address) {
   coming ??= new Promise((resolve, reject) => {
     const script = Object.assign(document.createElement("script"), { src: address });

@@ -1,4 +1,4 @@
-// Copies what stands beside its button, also where the browser keeps its clipboard to pages over HTTPS.
+// Copies the text beside a button, also if the browser offers the clipboard only to pages over HTTPS.
 
 import { t } from "../site/sentences.js";
 
@@ -10,7 +10,7 @@ async function copy(area) {
       await navigator.clipboard.writeText(area.value);
       return true;
     } catch {
-      // not allowed: as without it
+      // not allowed: continue as without a clipboard
     }
   }
   area.focus();

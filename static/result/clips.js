@@ -1,17 +1,17 @@
-// Short clips of videos: only those in view are loaded, and play over and over; stills where no motion is wanted.
+// Short clips of videos: only those in view are loaded, and play in a loop; stills are shown if no motion is wanted.
 
 import { t } from "../site/sentences.js";
 
-const NEAR = "200px"; // below the screen, so that a clip is there when it is scrolled to
+const NEAR = "200px"; // margin around the screen, so that a clip is loaded before it scrolls into view
 const END_S = 0.04;
-const LONGEST_MS = 8000; // that printing waits for a picture
+const LONGEST_MS = 8000; // longest time for which printing waits for a picture
 
 export class Clips {
   #videos;
   #playing;
   #seen = new Set();
 
-  /** `videos`: elements with data-src, data-begin and data-end [s]; with data-still only that moment [s] is shown. */
+  /** `videos` are elements with data-src, data-begin and data-end [s]; with data-still, only that moment [s] is shown. */
   constructor(videos, playing = false) {
     this.#videos = [...videos];
     this.#playing = playing;
@@ -32,7 +32,7 @@ export class Clips {
     for (const video of this.#seen) this.#show(video);
   }
 
-  /** Resolves when every clip shows a picture, or cannot: for print. */
+  /** Pause all clips for printing; resolve when each shows a picture or has failed, for each after LONGEST_MS at the latest. */
   stills() {
     this.playing = false;
     return Promise.all(
@@ -53,7 +53,7 @@ export class Clips {
       this.#show(target);
     } else if (this.#seen.delete(target)) {
       target.removeAttribute("src");
-      target.load(); // browsers have only so many players
+      target.load(); // browsers limit the number of players
     }
   }
 
@@ -65,11 +65,11 @@ export class Clips {
       video.preload = "auto";
       video.src = plays ? `${src}#t=${begin},${end}` : `${src}#t=${moment}`;
     }
-    if (plays) video.play().catch(() => {}); // one that left the screen meanwhile is not played
+    if (plays) video.play().catch(() => {}); // a clip that has left the screen meanwhile is not played
     else video.pause();
   }
 
-  /** From its beginning where it has come to its end. */
+  /** Start a clip again from its beginning when it has reached its end. */
   #again(video) {
     const { begin, end } = video.dataset;
     if (!this.#playing || !this.#seen.has(video) || video.dataset.still !== undefined || !(video.ended || video.currentTime >= Number(end) - END_S)) return;

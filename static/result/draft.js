@@ -1,4 +1,4 @@
-// The page of a draft: one step at a time, and saved as it is typed.
+// The page of a draft plan: one step at a time, saved while it is typed.
 
 import { post } from "../site/api.js";
 import { drafts } from "../site/drafts.js";
@@ -7,10 +7,10 @@ import { t } from "../site/sentences.js";
 const form = document.getElementById("draft");
 const said = document.getElementById("draft-saved");
 const BASE = `eva-base:${form.dataset.draft}`;
-let typed = 0; // how often something was typed
-let sent = 0; // the same as it was when it was last sent
+let typed = 0; // number of inputs so far
+let sent = 0; // that number at the last request
 
-let waiting = null; // the dialog that opens once everything is saved
+let waiting = null; // id of the dialog that opens once everything is saved
 
 function was() {
   return document.getElementById("draft-was").value;
@@ -73,7 +73,7 @@ function reason(xhr) {
   }
 }
 
-// What is typed is a change of what the page was shown then, also after a reload.
+// Edits refer to the version of the draft that the page showed when they began, also after a reload.
 form.addEventListener("input", () => {
   typed++;
   if (sessionStorage.getItem(BASE) === null) sessionStorage.setItem(BASE, was());
@@ -98,7 +98,7 @@ document.body.addEventListener("htmx:beforeSwap", ({ detail }) => {
     window.location.reload();
   }
 });
-// What is being confirmed is not exchanged below the hand: the server compares it with what there is.
+// An open dialog is not replaced while it is being confirmed; the server compares what it showed with the present draft.
 document.body.addEventListener("htmx:oobBeforeSwap", (event) => {
   if (event.detail.target.querySelector("dialog[open]")) event.detail.shouldSwap = false;
 });
@@ -136,7 +136,7 @@ async function preflight(button) {
   }
 }
 
-/** Open the question whether to freeze, with the power as it stands beside the design. */
+/** Open the dialog that asks whether to freeze the plan, with the power shown beside the design. */
 function askToFreeze(dialog) {
   if (!dialog) return;
   const line = dialog.querySelector("[data-power]");
@@ -176,7 +176,7 @@ document.addEventListener("input", ({ target }) => {
   }
 });
 
-/** With two checkpoints nobody has to say which one is compared with the control. */
+/** Ask which checkpoint is compared with the control only if there are more than two. */
 function challenger() {
   const field = document.querySelector(".draft-challenger");
   const ticked = form.querySelectorAll('[name="checkpoints"]:checked').length;

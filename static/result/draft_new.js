@@ -1,4 +1,4 @@
-// A plan that is begun: what was typed outlives a reload until the draft is made.
+// The page on which a plan is begun: what was typed survives a reload until the draft is made.
 
 import { drafts } from "../site/drafts.js";
 

@@ -1,4 +1,4 @@
-// Every figure can be kept: as SVG, as PNG drawn from it, and the numbers that it shows as CSV.
+// Downloads of every figure: as SVG, as PNG drawn from it, and the numbers it shows as CSV.
 
 import { t } from "../site/sentences.js";
 
@@ -9,7 +9,7 @@ const MARGIN = 16; // user units
 const SCALE = 2;
 const SVG = "http://www.w3.org/2000/svg";
 
-/** What `read` finds in the light theme, which is what is printed; nobody sees it change and change back. */
+/** Return what `read` finds in the light theme, which is used for print; the change is undone before anything is drawn. */
 function inLight(read) {
   const { dataset } = document.documentElement;
   const { theme } = dataset;
@@ -21,7 +21,7 @@ function inLight(read) {
   }
 }
 
-/** A colour as every program reads it, and how opaque it is: "#rrggbb" and 0 to 1; of "rgb(…)" or "color(srgb …)". */
+/** Convert a colour "rgb(…)" or "color(srgb …)" into a form that every program reads: ["#rrggbb", opacity from 0 to 1]. */
 function paint(colour) {
   if (colour === "none") return [colour, 1];
   const scale = colour.startsWith("color(") ? 255 : 1;
@@ -30,7 +30,7 @@ function paint(colour) {
   return [`#${parts.join("")}`, alpha];
 }
 
-/** Write how an element looks at its copy. */
+/** Copy the computed style of an element to its copy, as attributes. */
 function dressed(element, copy) {
   const looks = getComputedStyle(element);
   for (const name of LOOKS) copy.setAttribute(name, looks.getPropertyValue(name));
@@ -41,7 +41,7 @@ function dressed(element, copy) {
   }
 }
 
-/** A copy that needs no style sheet, on white, without links; with its size in user units. */
+/** Return a copy of the figure as text that needs no style sheet, on white and without links, with its size in user units. */
 function standalone(figure) {
   const copy = figure.cloneNode(true);
   const [own, copies] = [figure, copy].map((root) => [...root.querySelectorAll("path, rect, text")]);
@@ -79,7 +79,7 @@ const KEPT = {
   CSV: (figure) => new Blob([figure.querySelector("metadata").textContent], { type: "text/csv" }),
 };
 
-/** Of the page and of the figure: "blocks-v1-success-rates.png". */
+/** Return a file name from plan and figure, such as "blocks-v1-success-rates.png". */
 function named(title, kind) {
   const [, plan, version] = window.location.pathname.match(/plans\/([^/]+)\/(\d+)/) ?? [];
   const words = title.toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "");
@@ -94,7 +94,7 @@ async function keep(figure, kind) {
 
 const seen = new WeakSet();
 
-/** A line of buttons below each figure that has none yet, and below what is said of it. */
+/** Add a line of buttons below each figure that has none yet, and below the figure's caption. */
 function offer() {
   for (const figure of document.querySelectorAll("svg.drawing")) {
     if (seen.has(figure)) continue;

@@ -12,7 +12,7 @@ class Gallery {
   #choices = [...document.querySelectorAll("[data-field]")];
   #clips;
   #chosen = null;
-  #done = []; // {card, before}: what can be undone, the newest last
+  #done = []; // changes that can be undone, {card, before}, the newest last
   #asked = Promise.resolve();
 
   constructor() {
@@ -69,7 +69,7 @@ class Gallery {
     for (const name of document.querySelectorAll("[data-chosen]")) name.textContent = t("page.gallery.trial", "Trial {id}", { id: this.#chosen.dataset.trial });
   }
 
-  /** The neighbour of the chosen card to that side; in the next line the one that is nearest. */
+  /** Return the next card in the direction of the key, in another line the nearest one; undefined if there is none. */
   #neighbour(key) {
     const here = this.#cards.indexOf(this.#chosen);
     if (key === "ArrowLeft") return this.#cards[here - 1];
@@ -105,7 +105,7 @@ class Gallery {
     });
   }
 
-  /** What is pressed is done one after the other, each about what the one before it left. */
+  /** Do requests one after the other, so that each starts from the result of the previous one. */
   #next(work) {
     this.#asked = this.#asked.then(work).then(() => {
       const undo = element("clips-undo");
@@ -113,7 +113,7 @@ class Gallery {
     });
   }
 
-  /** Have it corrected; what was said before, null where nothing has changed. */
+  /** Send a correction; resolve to the previous values, or to null if nothing has changed. */
   async #send(card, content) {
     const before = Object.fromEntries(FIELDS.map((name) => [name, card.dataset[name]]));
     try {

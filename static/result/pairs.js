@@ -1,4 +1,4 @@
-// The last picture of each trial of a comparison, as it comes into view.
+// The last picture of each trial of a comparison, loaded when it comes into view.
 
 import { Clips } from "./clips.js";
 

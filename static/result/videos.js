@@ -1,4 +1,4 @@
-// Cameras of one recording, or of several that begin together, on one clock: play, step, speed, one slider, moments.
+// Player for the cameras of one recording, or of several that begin together: play, step, speed, slider, links to moments.
 
 import { cameras } from "../replay/cameras.js";
 import { Clock, Shifted } from "../replay/clock.js";
@@ -62,7 +62,7 @@ class Player {
     show();
   }
 
-  /** The nearest of the speeds there are. */
+  /** Choose the nearest available speed. */
   #choose(wanted) {
     const speed = this.#part("speed");
     const away = [...speed.options].map(({ value }) => Math.abs(Number(value) - wanted));
@@ -70,7 +70,7 @@ class Player {
     this.#clock.rate = Number(speed.value);
   }
 
-  /** Stand at a moment [s], with the pictures in view. */
+  /** Pause at a moment [s] and scroll the pictures into view. */
   goTo(seconds) {
     this.#clock.pause();
     this.#clock.seekRow(Math.round(seconds * this.#clock.fps));
@@ -93,7 +93,7 @@ class Player {
 
 let player = null;
 
-/** For the videos of the page, again where they came later. */
+/** Make the player for the videos of the page, also if they are loaded later. */
 function start() {
   const bar = document.querySelector("[data-player][hidden]");
   const groups = [...document.querySelectorAll(".result-videos[data-frames]")];

@@ -1,15 +1,16 @@
-// A position of a bench as drawings have it: from above in millimetres, the arms at the lower edge; markup and no page.
+// A position of a bench as drawings show it: from above, in millimetres, the arms at the lower edge. Makes markup and needs no
+// page.
 
 import { t } from "../site/sentences.js";
 
-export const ROUND = 32; // corners of what stands for a circle
-const STEP = 10; // mm for an arrow key, 1 with Shift
-const TURN = 5; // degrees for Page Up and Page Down, 1 with Shift
+export const ROUND = 32; // corners of a polygon that represents a circle
+const STEP = 10; // step of an arrow key [mm]; 1 with Shift
+const TURN = 5; // step of Page Up and Page Down [deg]; 1 with Shift
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-export const THING = t("page.bench.thing", "thing on the bench"); // what readers of the page call a thing that can be moved
-const REACH = 2000; // mm in which things of a lab's own may lie, whatever the area is
+export const THING = t("page.bench.thing", "thing on the bench"); // what screen readers call an object that can be moved
+const REACH = 2000; // bound [mm] on where the lab's own objects may lie, whatever the area is
 
-/** What lies on the bench of a position: [{key, name, kind, x, y, yaw, width, depth}], in millimetres and degrees. */
+/** Return the objects on the bench of a position: [{key, name, kind, x, y, yaw, width, depth}], in mm and degrees. */
 export function things(bench, sizes) {
   const found = [];
   if (bench?.plate) found.push({ key: "plate", name: t("page.bench.plate", "plate"), kind: "plate", yaw: 0, ...at(bench.plate), ...square(2 * sizes.plate) });
@@ -20,7 +21,7 @@ export function things(bench, sizes) {
   return found;
 }
 
-/** The bench with one of its things elsewhere; `change` has x, y, yaw, width or depth. */
+/** Return the bench with one object changed; `change` has x, y, yaw, width or depth. */
 export function placed(bench, thing, change) {
   const { x, y, yaw, width, depth } = { ...thing, ...change };
   const place = [metres(x), metres(y)];
@@ -29,14 +30,14 @@ export function placed(bench, thing, change) {
   return { ...bench, objects: { ...bench.objects, [thing.name]: [...place, turned(yaw), metres(width), metres(depth)] } };
 }
 
-/** The same, held to where the thing may lie. */
+/** Return the bench with one object changed, but kept inside the bounds for its kind. */
 export function moved(bench, thing, change, sizes) {
   const { x = thing.x, y = thing.y } = change;
   const [left, right, near, far] = thing.kind === "object" ? [-REACH, REACH, -REACH, REACH] : sizes.area.map(mm);
   return placed(bench, thing, { ...change, x: Math.min(Math.max(x, left), right), y: Math.min(Math.max(y, near), far) });
 }
 
-/** What a key does to a thing, {x, y} or {yaw}; null for a key that does nothing. */
+/** Return what a key does to an object, {x, y} or {yaw}; null for a key that does nothing. */
 export function stepped(thing, { key, shiftKey, ctrlKey, altKey, metaKey }) {
   if (ctrlKey || altKey || metaKey) return null;
   const [along, turns] = [ARROWS[key], { PageUp: 1, PageDown: -1 }[key]];
@@ -46,14 +47,14 @@ export function stepped(thing, { key, shiftKey, ctrlKey, altKey, metaKey }) {
   return null;
 }
 
-/** Where a thing lies, in words. */
+/** Say in words where an object lies. */
 export function whereabouts({ name, kind, x, y, yaw }) {
   const at = { name, x: n(x), y: n(y), yaw: n(yaw) };
   if (kind === "plate") return t("page.bench.at", "{name}: x {x} mm, y {y} mm", at);
   return t("page.bench.turned", "{name}: x {x} mm, y {y} mm, turned by {yaw}°", at);
 }
 
-/** The bench without one of its things. */
+/** Return the bench without one of its objects. */
 export function without(bench, thing) {
   const { [thing.kind]: _, ...rest } = bench;
   if (thing.kind !== "object") return rest;
@@ -61,7 +62,7 @@ export function without(bench, thing) {
   return { ...bench, objects };
 }
 
-/** The corners of a thing [mm], as many for a circle as make it one. */
+/** Return the corners of an object [mm]; a circle becomes a polygon of ROUND corners. */
 export function outline({ kind, x, y, yaw, width, depth }) {
   if (kind === "plate") {
     const turns = Array.from({ length: ROUND }, (_, k) => (2 * Math.PI * k) / ROUND);
@@ -72,7 +73,9 @@ export function outline({ kind, x, y, yaw, width, depth }) {
   return corners.map(([a, b]) => [x + a * cos - b * sin, y + a * sin + b * cos]);
 }
 
-/** What of the bench no simulated one would lay, or lies in something else: sentences. */
+/**
+ * Return sentences about objects that no simulated bench would place there, and about objects that are too close to each other.
+ */
 export function problems(bench, sizes) {
   const all = things(bench, sizes);
   const [left, right, near, far] = sizes.area.map(mm);
@@ -90,12 +93,12 @@ export function problems(bench, sizes) {
   return said;
 }
 
-/** True if an arm of the simulated bench grasps there; what lies on other benches is where people say. */
+/** Return true if an arm of the simulated bench can grasp the object; the lab's own objects always count as reachable. */
 export function reachable({ kind, x, y }, sizes) {
   return kind === "object" || sizes.sides.some((side) => Math.hypot(x - mm(side[0]), y - mm(side[1])) <= mm(sizes.reach));
 }
 
-/** What a drawing of these benches shows [mm]: {x, y, width, height}, y downwards as SVG has it. */
+/** Return the part that a drawing of these benches shows [mm]: {x, y, width, height}, with y downwards as in SVG. */
 export function windowOf(benches, sizes, margin = 40) {
   const [left, right, near, far] = sizes.area.map(mm);
   const corners = benches.flatMap((bench) => things(bench, sizes).flatMap(outline));
@@ -105,7 +108,7 @@ export function windowOf(benches, sizes, margin = 40) {
   return { x: low, y: -top, width: high - low, height: top - bottom };
 }
 
-/** The area in which things may lie, and the table around it, below everything else. */
+/** Return the markup of the area in which objects may lie and of the table around it, below everything else. */
 export function ground(sizes, { x, y, width, height }) {
   const [left, right, near, far] = sizes.area.map(mm);
   return (
@@ -114,7 +117,7 @@ export function ground(sizes, { x, y, width, height }) {
   );
 }
 
-/** One thing; `inside` is markup that moves and turns with it. */
+/** Return the markup of one object; `inside` is markup that moves and turns with it. */
 export function drawn(thing, { attributes = "", inside = "", words = "" } = {}) {
   const { kind, x, y, yaw, width, depth } = thing;
   const shape =
@@ -125,7 +128,10 @@ export function drawn(thing, { attributes = "", inside = "", words = "" } = {}) 
   return `<g class="thing thing-${kind}" ${attributes}><g transform="translate(${n(x)} ${n(-y)}) rotate(${n(-yaw)})">${shape}${inside}</g>${text}</g>`;
 }
 
-/** A small picture of a bench; without a title it says nothing that does not stand beside it. */
+/**
+ * Return a small picture of a bench. Without a title it is hidden from screen readers, because the text beside it says the
+ * same.
+ */
 export function thumbnail(bench, sizes, view, title, picture = "") {
   const all = things(bench, sizes);
   const [x, y, width, height] = [view.x, view.y, view.width, view.height].map(n);
@@ -144,12 +150,12 @@ export function escaped(text) {
   return String(text).replace(/[&<>"']/g, (sign) => `&#${sign.charCodeAt(0)};`);
 }
 
-/** Degrees from -180 to 180. */
+/** Normalize an angle to -180 up to 180 degrees, in tenths. */
 export function turned(yaw) {
   return Math.round((((((yaw + 180) % 360) + 360) % 360) - 180) * 10) / 10;
 }
 
-/** A number as markup has it. */
+/** Format a number for markup. */
 export function n(value) {
   return String(Math.round(value * 100) / 100);
 }
@@ -170,7 +176,7 @@ function mm(value) {
   return Math.round(value * 1e6) / 1e3;
 }
 
-/** To tenths of a millimetre, so that what is shown is what is saved. */
+/** Convert mm to metres in tenths of a millimetre, so that what is shown is what is saved. */
 function metres(value) {
   return Math.round(value * 10) / 1e4;
 }

@@ -1,4 +1,4 @@
-// The editor of a scene: everything typed and dragged is one table, kept as a draft until it is saved.
+// The editor of a scene: everything that is typed and dragged is one object, kept as a draft until it is saved.
 
 import { post, RequestFailed } from "../site/api.js";
 import { MilestoneList } from "./milestones.js";
@@ -7,7 +7,7 @@ import { Positions } from "./positions.js";
 import { t } from "../site/sentences.js";
 
 const PREVIEW_MS = 600;
-const SAVE_MS = 30000; // an outcome that is not known is worse than a long wait
+const SAVE_MS = 30000; // generous [ms], because an unknown outcome is worse than a long wait
 
 class Editor {
   #given = JSON.parse(document.getElementById("state").textContent);
@@ -43,7 +43,7 @@ class Editor {
     this.#faults.addEventListener("click", (event) => event.target.dataset.place && this.#find(event.target.dataset.place));
     this.#mark();
     this.#previewed();
-    document.querySelector(".scene-grid").inert = false; // what is typed before is not heard
+    document.querySelector(".scene-grid").inert = false; // enabled only now, because earlier inputs would be lost
   }
 
   #fill() {
@@ -63,7 +63,7 @@ class Editor {
     else this.scene[name] = field.value;
     const own = this.#form.querySelector("[data-of=name]");
     if (name === "title" && own && !own.dataset.typed) own.value = this.scene.name = named(field.value);
-    if (field === own) own.dataset.typed = "yes"; // it does not follow the title any more
+    if (field === own) own.dataset.typed = "yes"; // the name does not follow the title any more
     this.#changed();
   }
 
@@ -86,7 +86,7 @@ class Editor {
     location.reload();
   }
 
-  /** The operator's cards, of the position that is shown. */
+  /** Show the operator's cards for the position that is shown. */
   async #previewed() {
     if (!document.getElementById("operator").open) return;
     const place = document.getElementById("preview");
@@ -139,7 +139,7 @@ class Editor {
     this.#said.append(" ", look, " ", over);
   }
 
-  /** What is wrong, each a way to where it is; the fields are marked. */
+  /** List what is wrong, with a button that leads to each place, and mark the fields. */
   #show(faults) {
     for (const field of this.#form.querySelectorAll("[aria-invalid]")) field.removeAttribute("aria-invalid");
     this.#faults.replaceChildren(
@@ -175,7 +175,7 @@ class Editor {
   }
 }
 
-/** A short name of a title, for addresses. */
+/** Return a short name made from a title, for addresses. */
 function named(title) {
   return title.normalize("NFKD").toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 60);
 }

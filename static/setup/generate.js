@@ -1,14 +1,16 @@
-// Positions made from one by laying some of its things anew: in a grid, at random, or as a Latin hypercube. No page.
+// Positions made from one position by placing some of its objects anew: in a grid, at random, or as a Latin hypercube. Needs no
+// page.
 
 import { placed, problems, reachable, things } from "./bench.js";
 
-const TRIES = 4000; // for one position at random
-const DRAWS = 200; // of a Latin hypercube, until all of it can be laid
+const TRIES = 4000; // attempts per random position
+const DRAWS = 200; // draws of a Latin hypercube, until all of it can be laid out
 
 /**
- * Benches like `bench` with the things `keys` laid anew within `area` [mm: x from, to, y from, to], and turned by at most
- * `turn` degrees from where they are. `n` of them, or `columns` x `rows` of a grid, which moves one thing.
- * Returns {benches, left}: how many could not be laid, because they are too close to something or out of reach.
+ * Make benches like `bench` with the objects `keys` placed anew within `area` [mm: x from, to, y from, to], and turned by at
+ * most `turn` degrees from their present angles. Make `n` of them, or a grid of `columns` x `rows`, which moves one object.
+ * Return {benches, left}, where `left` counts those that could not be laid out, because something was too close or out of
+ * reach.
  */
 export function generated({ method, bench, sizes, keys, area, turn = 0, n, columns, rows, least = 0, seed = 1 }) {
   const chance = numbers(seed);
@@ -28,21 +30,21 @@ export function generated({ method, bench, sizes, keys, area, turn = 0, n, colum
   return { benches, left: n - benches.length };
 }
 
-/** How far apart two benches are: the way [mm] of the thing that lies most elsewhere. */
+/** Return the distance of two benches [mm]: the largest distance between the two places of one object. */
 export function distance(one, other, sizes) {
   const before = new Map(things(other, sizes).map((thing) => [thing.key, thing]));
   const ways = things(one, sizes).map(({ key, x, y }) => (before.has(key) ? Math.hypot(x - before.get(key).x, y - before.get(key).y) : 0));
   return Math.max(0, ...ways);
 }
 
-/** The least distance of two of them, Infinity where there are not two. */
+/** Return the least distance between any two of the benches; Infinity if there are fewer than two. */
 export function nearest(benches, sizes) {
   let least = Infinity;
   benches.forEach((one, index) => benches.slice(index + 1).forEach((other) => (least = Math.min(least, distance(one, other, sizes)))));
   return least;
 }
 
-/** Of each thing three shares of its ranges: along x, along y, of its turn. */
+/** Place each object by three shares of its ranges: along x, along y, and of its rotation. */
 function laid(bench, sizes, keys, [left, right, near, far], turn, shares) {
   let made = bench;
   keys.forEach((key, index) => {
@@ -62,7 +64,9 @@ function grid(columns, rows) {
   return Array.from({ length: rows * columns }, (_, k) => [share(k % columns, columns), share(Math.floor(k / columns), rows), 0.5]);
 }
 
-/** Each of n slices of each range is used once; drawn anew until all can be laid, else the draw with the most of them. */
+/**
+ * Use each of n slices of each range once. Draw again until all can be laid out, else return the draw with the most that can.
+ */
 function hypercube(n, dimensions, chance, lay, good) {
   let best = [];
   for (let draw = 0; draw < DRAWS && best.length < n; draw += 1) {
@@ -82,7 +86,7 @@ function shuffled(n, chance) {
   return found;
 }
 
-/** Numbers from 0 to below 1, the same for the same seed (mulberry32). */
+/** Return a generator of numbers from 0 to below 1, the same for the same seed (mulberry32). */
 export function numbers(seed) {
   let state = seed >>> 0;
   return () => {

@@ -1,10 +1,10 @@
-// Positions that are generated from the one that is shown: what is asked for, and what came of it, before it is kept.
+// Positions that are generated from the present one: the form, and the result before it is kept.
 
 import { things } from "./bench.js";
 import { generated, nearest } from "./generate.js";
 import { t } from "../site/sentences.js";
 
-const MOST = 100; // positions at once
+const MOST = 100; // positions that may be generated at once
 
 export class Generator {
   made = []; // benches that are not kept yet
@@ -14,7 +14,9 @@ export class Generator {
   #draw;
   #keep;
 
-  /** `bench()` is the one to begin from, `draw()` shows what is `made`, `keep(benches, replace)` takes it. */
+  /**
+   * `bench()` returns the bench to start from, `draw()` shows the benches in `made`, and `keep(benches, replace)` adds them.
+   */
   constructor(form, sizes, { bench, draw, keep }) {
     this.#form = form;
     this.#sizes = sizes;
@@ -23,7 +25,7 @@ export class Generator {
     this.#keep = keep;
     form.addEventListener("change", () => this.offer());
     form.addEventListener("submit", (event) => {
-      event.preventDefault(); // Enter in one of its fields
+      event.preventDefault(); // Enter in a field must not send the form
       this.#generate();
     });
     for (const [id, act] of Object.entries({
@@ -34,7 +36,7 @@ export class Generator {
     })) document.getElementById(id).addEventListener("click", act);
   }
 
-  /** The fields of the method that is chosen, and what can be laid elsewhere. */
+  /** Show the fields of the chosen method, and offer the objects that can be placed anew. */
   offer() {
     const method = this.#form.elements.method.value;
     for (const field of this.#form.querySelectorAll("[data-methods]")) field.hidden = !field.dataset.methods.split(" ").includes(method);

@@ -1,10 +1,10 @@
-// The milestones of a scene: a list in the order of their keys, dragged or moved by arrow keys.
+// The milestones of a scene: a list in the order of their keys, reordered by dragging or by arrow keys.
 
 import { orderable } from "./order.js";
 import { t } from "../site/sentences.js";
 
 const FIELDS = ["text", "points", "required", "time_limit_s", "truth"];
-const KEYS = 9; // milestones that have a key at scoring
+const KEYS = 9; // number of milestones that have a key at scoring
 
 const inAll = (n) => (n === 1 ? t("page.milestones.point", "1 point in all") : t("page.milestones.points", "{n} points in all", { n }));
 
@@ -39,7 +39,7 @@ export class MilestoneList {
       const row = this.#rows.children[index];
       for (const name of FIELDS) {
         const field = row.querySelector(`[data-milestone=${name}]`);
-        // A bench of the lab's own may report what ours do not: it is shown as it is kept.
+        // A bench of the lab's own may report values that ours do not: they are shown as they are stored.
         if (field.matches("select") && ![...field.options].some(({ value }) => value === milestone[name])) field.add(new Option(milestone[name], milestone[name]));
         if (field.type === "checkbox") field.checked = milestone[name];
         else field.value = milestone[name] ?? "";

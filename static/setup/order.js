@@ -1,6 +1,6 @@
-// A list whose rows are brought into another order: dragged by their handles, or moved with the arrow keys there.
+// A list whose rows can be reordered: dragged by their handles, or moved by the arrow keys on a handle.
 
-/** `moved(from, to)` is told of each row that goes elsewhere; the list is then drawn anew by whoever has its contents. */
+/** `moved(from, to)` is called for each row that moves; its owner then draws the list again. */
 export function orderable(list, moved) {
   const rows = () => [...list.children];
   const indexOf = (target) => rows().indexOf(target.closest("li"));

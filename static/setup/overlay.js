@@ -1,6 +1,6 @@
-// The wanted layout over a picture of the real bench: live from a camera, or the reference of the position. The corners of
-// the area are dragged to where they lie in the picture; this browser remembers them for each camera. Then things can be
-// dragged there too. A picture of one's own stays in the browser.
+// The wanted layout over a picture of the real bench: live from a camera, the position's reference, or a file. The user drags
+// the corners of the area to where they lie in the picture; this browser remembers them for each camera. Then objects can be
+// dragged in the picture too. A file of the user's own never leaves the browser.
 
 import { get } from "../site/api.js";
 import { escaped, moved, n, outline, stepped, THING, things, whereabouts } from "./bench.js";
@@ -8,9 +8,9 @@ import { projection, seen } from "./plane.js";
 import { t } from "../site/sentences.js";
 
 const LIVE_MS = 700;
-const AGAIN_MS = 3000; // after a picture that did not come
+const AGAIN_MS = 3000; // wait after a picture that could not be loaded [ms]
 const SIDE = 1000; // units of the drawing along each side of the picture
-const FIRST = [[0.2, 0.85], [0.8, 0.85], [0.7, 0.25], [0.3, 0.25]]; // left and right near, right and left far: shares
+const FIRST = [[0.2, 0.85], [0.8, 0.85], [0.7, 0.25], [0.3, 0.25]]; // left and right near, right and left far corner, as shares of the picture
 const NAMES = [t("page.overlay.left_near", "left near corner"), t("page.overlay.right_near", "right near corner"), t("page.overlay.right_far", "right far corner"), t("page.overlay.left_far", "left far corner")];
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
@@ -20,8 +20,8 @@ export class Overlay {
   #addresses;
   #stations;
   #bench = {};
-  #changed = null; // is told of each bench that a person makes of the one that is shown; null: nothing can be moved
-  #own = null; // {name, address} of a picture that was chosen from this computer
+  #changed = null; // called with each bench that the user makes by moving objects; null if nothing may be moved
+  #own = null; // {name, address} of a picture file of the user's own
   #references = [];
   #corners = FIRST;
   #timer = 0;
@@ -46,7 +46,7 @@ export class Overlay {
     this.#part("picture").addEventListener("error", () => this.#trouble());
   }
 
-  /** The position that is looked at: its bench, its references, and who is told where a thing was dragged to. */
+  /** Show the position's bench over its references; `changed(bench)` is called when an object was moved. */
   show(bench, references, changed = null) {
     this.#bench = bench ?? {};
     this.#changed = changed;
@@ -112,7 +112,7 @@ export class Overlay {
     again();
   }
 
-  /** Say why there is no picture, and look again a little later. */
+  /** Show why there is no picture, and try again a little later. */
   async #trouble() {
     clearTimeout(this.#timer);
     this.#part("picture").hidden = true;
@@ -175,7 +175,7 @@ export class Overlay {
     return things(this.#bench, this.#sizes).find((one) => one.key === key);
   }
 
-  /** A thing follows the pointer over the plane of the table. */
+  /** Return a function that lets an object follow the pointer over the plane of the table. */
   #following(thing) {
     const [left, right, near, far] = this.#sizes.area.map((side) => 1000 * side);
     const plane = projection(this.#corners, [[left, near], [right, near], [right, far], [left, far]]);
@@ -200,7 +200,7 @@ export class Overlay {
       const { left, top, width, height } = svg.getBoundingClientRect();
       move((clientX - left) / width, (clientY - top) / height);
     };
-    if (over) drag(event); // from here on it follows
+    if (over) drag(event); // sets where the drag starts
     const end = () => {
       svg.removeEventListener("pointermove", drag);
       for (const kind of ["pointerup", "pointercancel"]) svg.removeEventListener(kind, end);

@@ -1,6 +1,6 @@
-// From the bench to a picture of it: the projection of a plane that four points and their places in the picture fix.
+// The projection from the bench to a picture of it, as four points of a plane and their places in the picture define it.
 
-/** The projection that takes four points [x, y] to four others, as nine numbers; null where three of them are in line. */
+/** Return the projection that maps four points [x, y] to four others, as nine numbers; null if three of them are collinear. */
 export function projection(from, to) {
   const rows = from.flatMap(([x, y], k) => {
     const [u, v] = to[k];
@@ -13,13 +13,16 @@ export function projection(from, to) {
   return found && [...found, 1];
 }
 
-/** Where a point of the plane is in the picture. */
+/** Return where a point of the plane lies in the picture. */
 export function seen(h, [x, y]) {
   const depth = h[6] * x + h[7] * y + h[8];
   return [(h[0] * x + h[1] * y + h[2]) / depth, (h[3] * x + h[4] * y + h[5]) / depth];
 }
 
-/** Gauss's elimination with the largest pivot; each row ends with its right side. */
+/**
+ * Solve linear equations by Gaussian elimination with the largest pivot; each row ends with its right side. Return null if they
+ * are singular.
+ */
 function solved(rows) {
   const size = rows.length;
   for (let k = 0; k < size; k += 1) {

@@ -1,4 +1,4 @@
-// The positions of a scene: thumbnails, and the one that is on the stage with its numbers.
+// The positions of a scene: thumbnails, and the present position on the stage and in numbers.
 
 import { escaped, placed, problems, things, thumbnail, windowOf, without } from "./bench.js";
 import { Generator } from "./generator.js";
@@ -6,7 +6,7 @@ import { Stage } from "./stage.js";
 import { t } from "../site/sentences.js";
 
 const NUMBERS = [["x", "x mm"], ["y", "y mm"], ["yaw", t("page.positions.turn", "turn °")], ["width", t("page.positions.width", "width mm")], ["depth", t("page.positions.depth", "depth mm")]];
-const OBJECT = [0, 0.3, 0, 0.08, 0.08]; // metres and degrees
+const OBJECT = [0, 0.3, 0, 0.08, 0.08]; // m, m, degrees, m, m
 
 export class Positions {
   index = 0;
@@ -17,7 +17,7 @@ export class Positions {
   #changed;
   #overlay;
   #stage;
-  #view; // of the thumbnails
+  #view; // view box of the thumbnails
   #generator;
   #part = (id) => document.getElementById(id);
 
@@ -105,7 +105,7 @@ export class Positions {
     if (button) this.choose(Number(button.dataset.index));
   }
 
-  /** Label, words and the numbers of everything that lies there; `whole`: also the fields that a person may be in. */
+  /** Show label, description and the numbers of all objects; with `whole`, also in fields that the user may be editing. */
   #numbers(whole) {
     const one = this.#one;
     const why = this.kept[one?.id];
@@ -149,7 +149,7 @@ export class Positions {
   #laid(bench) {
     this.#one.bench = bench;
     this.#numbers(false);
-    const picture = this.#part("thumbnails").children[this.index].querySelector("svg"); // the others stay as they are
+    const picture = this.#part("thumbnails").children[this.index].querySelector("svg"); // the other thumbnails do not change
     picture.outerHTML = thumbnail(bench, this.#bench, this.#view, "", this.#references[this.#one.id]?.[0].picture);
     this.#told();
     this.#changed();
@@ -175,7 +175,7 @@ export class Positions {
     this.#part("add-thing").focus();
   }
 
-  /** The simulated bench's block or plate, or an object by its name. */
+  /** Add an object: the simulated bench's block or plate, or one with a name. */
   #thing() {
     const kind = this.#part("add-kind").value;
     const name = this.#part("thing-name").value.trim();
@@ -199,7 +199,7 @@ export class Positions {
     this.#part("positions-said").textContent = words;
   }
 
-  /** One like the position that is shown. */
+  /** Add a position like the present one. */
   #added() {
     const like = this.#one ?? { label: "", description: "", bench: null };
     this.#all.push({ ...structuredClone(like), id: null, label: "", number: 0 });
@@ -217,13 +217,13 @@ export class Positions {
     this.#changed();
   }
 
-  /** Those that are not saved yet go on counting after those that are. */
+  /** Number the positions that are not saved yet, after those that are. */
   #numbered() {
     let number = Math.max(0, ...this.#all.filter(({ id }) => id).map((one) => one.number));
     for (const one of this.#all) if (!one.id) one.number = number += 1;
   }
 
-  /** Positions that were generated join the others, in place of those that may go if that is wanted. */
+  /** Add generated positions; with `replace`, they replace all positions that may be removed. */
   #keep(benches, replace) {
     const { description } = this.#one;
     if (replace) this.#editor.scene.positions = this.#all.filter(({ id }) => this.kept[id]);

@@ -1,11 +1,11 @@
-// A sheet of paper on which the positions of a scene are drawn in true millimetres, to be laid on the bench.
+// A sheet of paper with the positions of a scene in true size, to be laid on the bench.
 
 import { box, drawn, escaped, n, outline, things } from "./bench.js";
 import { t } from "../site/sentences.js";
 
 const PAPERS = { A4: [297, 210], A3: [420, 297], A2: [594, 420], A1: [841, 594], A0: [1189, 841] };
-const EDGE = 12; // mm that printers leave white
-const HEAD = 26; // mm above the drawing, for title and scale
+const EDGE = 12; // margin that printers leave white [mm]
+const HEAD = 26; // space above the drawing for title and scale [mm]
 const GRID = 100;
 
 const { title, bench, positions } = JSON.parse(document.getElementById("drawn").textContent);
@@ -16,7 +16,7 @@ function chosen() {
   return positions.filter(({ number }) => ticked.has(number));
 }
 
-/** The part of the bench that has to be on the sheet [mm]: left, right, near, far. */
+/** Return the part of the bench that must be on the sheet [mm]: left, right, near, far; null if there is nothing to draw. */
 function extent(rows) {
   const corners = rows.flatMap((row) => things(row.bench, bench).flatMap(outline));
   const [xs, ys] = [corners.map(([x]) => x), corners.map(([, y]) => y)];

@@ -1,9 +1,9 @@
-// The bench from above, on which things are moved and turned with mouse, finger and keys. Millimetres and degrees.
+// The bench from above, with objects that can be moved and turned by mouse, touch and keys, in mm and degrees.
 
 import { box, drawn, ground, moved, n, stepped, THING, things, turned, whereabouts, windowOf } from "./bench.js";
 import { t } from "../site/sentences.js";
 
-const HANDLE = 26; // mm from a thing's far edge to the handle that turns it
+const HANDLE = 26; // distance [mm] from an object's far edge to the handle that turns it
 
 export class Stage {
   #svg;
@@ -13,9 +13,9 @@ export class Stage {
   #still = true;
   #ghosts = [];
   #view;
-  #chosen = ""; // key of the thing whose handle is shown
+  #chosen = ""; // key of the object whose handle is shown
 
-  /** `changed(bench)` is told of each bench that a person makes of the one that is shown. */
+  /** `changed(bench)` is called with each bench that the user makes by moving an object. */
   constructor(svg, sizes, changed) {
     this.#svg = svg;
     this.#sizes = sizes;
@@ -25,7 +25,10 @@ export class Stage {
     svg.addEventListener("focusin", (event) => this.#choose(event.target.closest("[data-thing]")?.dataset.thing));
   }
 
-  /** Show this bench, and faintly those of `ghosts`; `still`: nothing of it can be moved. */
+  /**
+   * Show this bench and, faintly, those of `ghosts`; with `still`, nothing can be moved. `all` are benches that fit in the view
+   * too.
+   */
   show(bench, { still = false, ghosts = this.#ghosts, all = [] } = {}) {
     this.#bench = bench ?? {};
     this.#still = still;

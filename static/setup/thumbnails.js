@@ -1,4 +1,4 @@
-// Lists of scenes: each position drawn small, in the same window as the others of its scene.
+// Lists of scenes: a small drawing of each position, in the same view box as the others of its scene.
 
 import { thumbnail, windowOf } from "./bench.js";
 import { t } from "../site/sentences.js";

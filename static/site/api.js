@@ -1,10 +1,10 @@
-// Requests to our own server: the session's cookie, the CSRF token, and one sentence for whatever goes wrong.
+// Requests to the server of this site, with the session's cookie and the CSRF token; every failure becomes one sentence.
 
 import { sentence, t } from "./sentences.js";
 
 const TIMEOUT_MS = 8000;
 
-/** What the server refused, or that it did not answer; `unknown` where nobody knows whether it was done. */
+/** A request that the server refused or did not answer; `unknown` is true if nobody knows whether it was carried out. */
 export class RequestFailed extends Error {
   constructor(message, { status = 0, body = {}, unknown = false } = {}) {
     super(message);
@@ -37,8 +37,8 @@ async function bodyOf(response) {
 }
 
 /**
- * Send `content` as JSON; resolves to the answer's JSON, throws RequestFailed. `simple`: without the CSRF token, as no
- * browser first asks another port whether it may.
+ * Send `content` as JSON and resolve to the JSON of the answer; throw RequestFailed on any failure. With `simple`, send it as
+ * plain text without the CSRF token, so that the browser sends no preflight request before it posts to another port.
  */
 export async function post(address, content, { timeout = TIMEOUT_MS, simple = false } = {}) {
   let response;
@@ -47,7 +47,7 @@ export async function post(address, content, { timeout = TIMEOUT_MS, simple = fa
       method: "POST",
       headers: simple ? { "Content-Type": "text/plain" } : { "Content-Type": "application/json", "X-CSRFToken": token() },
       body: JSON.stringify(content),
-      credentials: "include", // also to the process for stops, at another port of ours
+      credentials: "include", // the process for stops, on another port of this host, needs the cookie too
       redirect: "manual",
       signal: AbortSignal.timeout(timeout),
     });
@@ -67,7 +67,7 @@ export async function post(address, content, { timeout = TIMEOUT_MS, simple = fa
   return body;
 }
 
-/** The JSON at `address`; throws RequestFailed. */
+/** Return the JSON at `address`; throw RequestFailed on any failure. */
 export async function get(address) {
   let response;
   try {

@@ -1,6 +1,6 @@
-// Looking into values that ascend.
+// Binary search in ascending values.
 
-/** The last index whose value in the ascending `values` is not above `value`, -1 where there is none. */
+/** Return the last index whose value in the ascending `values` is not above `value`, or -1 if there is none. */
 export function lastNotAbove(values, value) {
   let low = 0;
   let high = values.length;

@@ -1,4 +1,4 @@
-// What was typed and not yet sent outlives a reload and a replaced fragment, and is forgotten once it was saved.
+// Keeps what was typed but not yet sent across a reload or a replaced fragment, and forgets it once it was saved.
 
 const KEY = (name) => `eva-draft:${name}`;
 
@@ -32,7 +32,7 @@ function fill(owner, values) {
   }
 }
 
-/** Choose what was chosen, where it is still offered; whoever follows the choice hears of it. */
+/** Restore the choice `value` if the list still offers it, and send "change" for scripts that follow the choice. */
 function choose(select, value) {
   if (select.value === value || ![...select.options].some((option) => option.value === value)) return;
   select.value = value;
@@ -46,7 +46,7 @@ function restore() {
   }
 }
 
-/** Keep drafts of everything with data-draft; "eva:saved" on it forgets its draft. */
+/** Keep drafts of all fields and forms with data-draft; the event "eva:saved" on one of them deletes its draft. */
 export function drafts() {
   document.addEventListener("input", (event) => {
     const owner = event.target.closest("[data-draft]");
@@ -56,7 +56,7 @@ export function drafts() {
     const owner = event.target.closest("[data-draft]");
     if (owner) sessionStorage.removeItem(KEY(owner.dataset.draft));
   });
-  // At once: what is typed into a new fragment before it was filled would take the place of its draft.
+  // Restore right after the swap: text typed into the new fragment before that would overwrite its draft.
   document.body.addEventListener("htmx:afterSwap", restore);
   document.body.addEventListener("htmx:afterSettle", restore);
   restore();

@@ -1,12 +1,12 @@
-// Find anything: one field, what there is in the lab by kind, and the commands of this page. Ctrl+K or Cmd+K.
+// The dialog Find (Ctrl+K or Cmd+K): one field that finds things of the lab by kind, and commands of this page.
 
 import { get, RequestFailed } from "./api.js";
 import { meaning, open, press, refusal } from "./keys.js";
 import { t } from "./sentences.js";
 
-const WAIT_MS = 90; // between two letters of somebody who types
-const MOST = 8; // of a group
-// What may be pressed from here: nothing that moves a robot, and nothing that stops one.
+const WAIT_MS = 90; // time to wait after each letter before the server is asked [ms]
+const MOST = 8; // commands shown at most
+// Controls that may be pressed from Find: none that moves a robot, and none that stops one.
 const COMMANDS = [
   ...["view", "toggle", "open-panel", "lease", "how", "preflight-ask", "confirm-cameras"].map((name) => `[data-${name}]`),
   ...["record_start", "record_stop"].map((kind) => `[data-command="${kind}"]`),
@@ -21,10 +21,10 @@ class Find {
   #said = document.getElementById("find-said");
   #options = [];
   #at = 0;
-  #shown = ""; // the words whose answer is in the list
-  #asked = 0; // how often the server was asked: an answer that comes after a later one is nothing
+  #shown = ""; // the words whose results are in the list
+  #asked = 0; // number of requests so far; an answer is ignored if a later request was sent
   #timer = 0;
-  #hasty = null; // Enter before the answer was there
+  #hasty = null; // how Enter was pressed before the answer had come, else null
 
   constructor() {
     for (const button of document.querySelectorAll("[data-open-find]")) button.addEventListener("click", () => this.#open());
@@ -32,13 +32,13 @@ class Find {
     this.#words.addEventListener("input", () => this.#typed());
     this.#dialog.addEventListener("keydown", (event) => this.#within(event));
     this.#dialog.addEventListener("click", (event) => event.target === this.#dialog && this.#dialog.close());
-    this.#dialog.addEventListener("close", () => this.#dialog.open || this.#forget()); // told late: it may be open again
+    this.#dialog.addEventListener("close", () => this.#dialog.open || this.#forget()); // "close" is sent late: the dialog may be open again
     this.#list.addEventListener("click", (event) => this.#clicked(event));
   }
 
   #key(event) {
     if (event.altKey || event.shiftKey || !(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "k") return;
-    event.preventDefault(); // also of a browser's own search
+    event.preventDefault(); // prevents the browser's own search as well
     if (this.#dialog.open) this.#dialog.close();
     else if (!document.querySelector("dialog:modal")) this.#open();
   }
@@ -52,7 +52,7 @@ class Find {
     if (!this.#words.value) this.#draw("", []);
   }
 
-  /** What was asked for is nothing once it is closed, and the next key is the page's. */
+  /** Drop a pending request and its answer, and blur the field so that the next key goes to the page. */
   #forget() {
     clearTimeout(this.#timer);
     this.#hasty = null;
@@ -89,7 +89,7 @@ class Find {
   // --- the list --------------------------------------------------------------------------------------------
 
   #draw(words, groups) {
-    if (!words) this.#asked += 1; // whatever is under way is for words that are gone
+    if (!words) this.#asked += 1; // answers under way are for words that were deleted
     this.#shown = words;
     const commands = commandsFor(words);
     const all = groups.map(({ name, items, more }) => ({ name, more, options: items.map(link) }));
@@ -128,13 +128,13 @@ class Find {
       event.preventDefault();
       this.#enter({ apart: event.ctrlKey || event.metaKey });
     } else return;
-    event.stopPropagation(); // no key of the page
+    event.stopPropagation(); // the key must not act on the page
   }
 
   #enter(how) {
     const words = this.#now();
     if (words && words !== this.#shown) {
-      this.#hasty = how; // as soon as the answer is there
+      this.#hasty = how; // pressed as soon as the answer has come
       return;
     }
     this.#hasty = null;
@@ -145,13 +145,13 @@ class Find {
 
   #clicked(event) {
     const option = event.target.closest("[role=option]");
-    if (!option || event.ctrlKey || event.metaKey) return; // a new tab: this one stays as it is
+    if (!option || event.ctrlKey || event.metaKey) return; // opens a new tab, so this one stays as it is
     this.#dialog.close();
     if (option.presses) press(option.presses);
   }
 }
 
-/** The controls of this page that fit, as `?` names them. */
+/** Return the controls of this page whose meaning, as the list of keys (`?`) gives it, contains all words of `query`. */
 function commandsFor(query) {
   const words = query.toLowerCase().split(" ");
   const all = [...document.querySelectorAll(COMMANDS.join())].filter((element) => element.checkVisibility());
@@ -167,7 +167,7 @@ function section({ name, more, options }, index) {
   const group = document.createElement("div");
   group.setAttribute("role", "group");
   const head = Object.assign(document.createElement("div"), { className: "small muted find-kind", id: `find-kind-${index}` });
-  head.setAttribute("role", "presentation"); // a list of choices has nothing else in it
+  head.setAttribute("role", "presentation"); // a listbox may only contain options and groups
   head.textContent = more ? t("page.find.more", "{name} · more match: type more", { name }) : name;
   group.setAttribute("aria-labelledby", head.id);
   group.append(head, ...options);
@@ -192,7 +192,7 @@ function link({ title, detail, address }) {
 function button(control) {
   const element = option(document.createElement("button"), meaning(control), refusal(control));
   element.type = "button";
-  element.presses = control; // the very control: lease, gates and refusals are its own
+  element.presses = control; // pressing the control itself keeps its lease check, its gate and its refusal
   return element;
 }
 

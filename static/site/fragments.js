@@ -1,7 +1,7 @@
-// Fragments of the page that the server renders: put in only where they differ from what it rendered before, so
-// that nobody's cursor jumps and nothing flickers.
+// Fragments that the server renders: swapped in only if they differ from its previous answer, so that no cursor jumps and
+// nothing flickers.
 
-const rendered = new Map(); // element -> what the server last rendered into it
+const rendered = new Map(); // element -> HTML that the server last rendered into it
 
 function normal(html) {
   const template = document.createElement("template");
@@ -9,13 +9,13 @@ function normal(html) {
   return template.innerHTML.trim();
 }
 
-/** Watch htmx. To be called before any module changes what the server rendered. */
+/** Make htmx skip swaps that change nothing. Call this before any module changes what the server rendered. */
 export function quietFragments() {
   for (const element of document.querySelectorAll("[hx-get]:not(select)")) rendered.set(element, normal(element.innerHTML));
   document.body.addEventListener("htmx:beforeSwap", (event) => {
     const { target, serverResponse, xhr, shouldSwap } = event.detail;
     if (xhr.responseURL.includes("/login/")) {
-      event.detail.shouldSwap = false; // the session has ended: the login page, not its form inside ours
+      event.detail.shouldSwap = false; // the session has ended: show the login page, not its form inside this page
       window.location.reload();
       return;
     }

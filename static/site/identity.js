@@ -1,11 +1,11 @@
-// Names that nobody else has. `crypto.randomUUID` exists on secure addresses alone; a lab's is often plain HTTP.
+// Unique identifiers. `crypto.randomUUID` exists only on secure origins, and a lab often uses plain HTTP.
 
 function hex(count) {
   const bytes = crypto.getRandomValues(new Uint8Array(count));
   return [...bytes].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 }
 
-/** A random UUID (version 4). */
+/** Return a random UUID (version 4). */
 export function uuid() {
   const digits = [...hex(16)];
   digits[12] = "4";
@@ -18,12 +18,12 @@ const KEY = "eva-page";
 const ASK_MS = 120;
 
 /**
- * The name of this page: the same after a reload, so that it keeps its lease, and another one in a duplicated
- * tab, so that two pages never command as one.
+ * Return the identifier of this page. It stays the same after a reload, so that the page keeps its lease; a duplicated tab gets
+ * another one, so that two pages never command as one.
  */
 export async function pageId() {
   const channel = new BroadcastChannel("eva-pages");
-  const self = hex(8); // of this document
+  const self = hex(8); // identifies this document
   let id = sessionStorage.getItem(KEY) || hex(8);
   const taken = new Promise((resolve) => {
     channel.addEventListener("message", ({ data }) => {

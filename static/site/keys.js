@@ -1,11 +1,12 @@
-// Keys of every page: whatever has data-key can be pressed with it; `?` shows all of them, and why some cannot be now.
+// Keyboard shortcuts of every page: a key presses the control with that data-key. `?` lists all keys, and why some cannot be
+// used now.
 
 import { t } from "./sentences.js";
 
 const TEXTS = 'input:not([type="checkbox"], [type="radio"], [type="range"], [type="number"]), textarea, [contenteditable="true"]';
 const STOPS = '[data-command="stop"], [data-command="halt"], [data-command="cancel"]';
-const SCROLLED = 'select, input[type="range"], input[type="radio"], #events'; // they go by arrows of their own
-const PRESSED = "button, summary, a[href]"; // by Enter and Space, where they have the focus
+const SCROLLED = 'select, input[type="range"], input[type="radio"], #events'; // controls that use the arrow keys themselves
+const PRESSED = "button, summary, a[href]"; // controls that Enter and Space press while they have the focus
 const CAPS = { arrowleft: "←", arrowright: "→", arrowup: "↑", arrowdown: "↓", pageup: "PgUp", pagedown: "PgDn", shift: "⇧" };
 const ELSEWHERE = t("page.keys.elsewhere", "not on the screen at the moment");
 
@@ -13,7 +14,7 @@ function usable(element) {
   return element.checkVisibility();
 }
 
-/** The names under which a press may be known: with Shift first the key with it, then the key alone. */
+/** Return the names under which a key press may be registered: with Shift, the combination before the key alone. */
 export function namesOf({ key: pressed, ctrlKey, shiftKey }) {
   const key = pressed === " " ? "space" : pressed.toLowerCase();
   if (ctrlKey) return [`ctrl+${key}`];
@@ -21,7 +22,7 @@ export function namesOf({ key: pressed, ctrlKey, shiftKey }) {
   return shifted ? [`shift+${key}`, key] : [key];
 }
 
-/** A key as it stands on a keyboard. */
+/** Return a key as it is labelled on a keyboard. */
 export function label(key) {
   return key
     .split("+")
@@ -30,7 +31,7 @@ export function label(key) {
     .replace("⇧ + ", "⇧");
 }
 
-/** What it does, in words. */
+/** Return what a control does, in words. */
 export function meaning(element) {
   if (element.dataset.keyText) return element.dataset.keyText;
   const words = element.cloneNode(true);
@@ -38,14 +39,17 @@ export function meaning(element) {
   return words.textContent.trim();
 }
 
-/** Why it cannot be pressed now, "" where it can. */
+/** Return why a control cannot be pressed now, or "" if it can. */
 export function refusal(element) {
   if (!usable(element)) return ELSEWHERE;
   if (element.disabled) return element.title || t("page.keys.not_now", "not now");
   return element.getAttribute("aria-disabled") === "true" ? element.title || t("page.keys.not_now", "not now") : "";
 }
 
-/** Of each key the one that it presses; where that is not on the screen all that it would press, each meaning once. */
+/**
+ * Return the rows of the list of keys. For each key this is the control that it presses now; if none of its controls is on the
+ * screen, it is every one of them, with each meaning once.
+ */
 function known() {
   const all = [...document.querySelectorAll("[data-key]")];
   const rows = new Map();
@@ -55,7 +59,7 @@ function known() {
   const shown = new Set(rows.keys());
   for (const element of all) {
     const { key } = element.dataset;
-    if (shown.has(key)) continue; // a key is that of the first that has it, as when it is pressed
+    if (shown.has(key)) continue; // a key belongs to its first usable control, as in `meant`
     const others = rows.get(key) ?? [];
     if (!others.some((one) => meaning(one) === meaning(element))) rows.set(key, [...others, element]);
   }
@@ -83,17 +87,19 @@ function show(dialog) {
   const rows = known();
   for (const one of [...rows.filter(({ why }) => !why), ...rows.filter(({ why }) => why)]) list.append(...row(one));
   open(dialog);
-  dialog.focus({ preventScroll: true }); // no control of it: Space stays the e-stop
+  dialog.focus({ preventScroll: true }); // focuses no control, so that Space remains the e-stop
   dialog.scrollTop = 0;
 }
 
-/** Open a dialog: at a station never as a modal one, which would put the e-stop out of reach. */
+/** Open a dialog. On a station's page it is never modal, because a modal dialog would put the e-stop out of reach. */
 export function open(dialog) {
   if (document.getElementById("estop-area")) dialog.show();
   else dialog.showModal();
 }
 
-/** What is pressed with it: the first that is on the page, and visible unless `hidden`. */
+/**
+ * Return the control that a key event presses: the first one with this key that is usable or, with `hidden`, any; else null.
+ */
 function meant(event, hidden = false) {
   for (const name of namesOf(event)) {
     const element = [...document.querySelectorAll(`[data-key="${CSS.escape(name)}"]`)].find((one) => hidden || usable(one));
@@ -102,10 +108,14 @@ function meant(event, hidden = false) {
   return null;
 }
 
-/** Fields keep what they are typed with: numbers their digits, lists their letters but for those that stop. */
+/**
+ * Return true if the focused control needs the key itself: text fields need every key, number fields all but letters and Space,
+ * lists all but those of stop commands, buttons and links Enter and Space, and sliders, radio buttons and the list of events
+ * the arrow keys.
+ */
 function kept(event, element) {
   const field = event.target;
-  if (!field.closest || event.ctrlKey || !usable(field)) return false; // what was just closed keeps the focus for a moment
+  if (!field.closest || event.ctrlKey || !usable(field)) return false; // a control that was just hidden keeps the focus for a moment
   if (field.closest(TEXTS)) return true;
   if (field.closest('input[type="number"]')) return !/^[a-z ]$/i.test(event.key);
   if (field.closest("select") && !element?.matches(STOPS)) return true;
@@ -113,14 +123,14 @@ function kept(event, element) {
   return /^(Arrow|Page)/.test(event.key) && Boolean(field.closest(SCROLLED));
 }
 
-/** Press a control, or put the cursor into a field. */
+/** Press a control, or focus it if it is a field. */
 export function press(element) {
   const written = element.matches('select, textarea, input:not([type="checkbox"], [type="radio"])');
   if (!written) element.click();
   else if (!element.disabled) element.focus();
 }
 
-/** Listen for keys; `refused` is told in words of one whose control is not on the screen. */
+/** Listen for keys; `refused(text)` is called if the control of a key is not on the screen. */
 export function keyboard(refused = () => {}) {
   const dialog = document.getElementById("keys");
   for (const button of document.querySelectorAll("[data-open-keys]")) button.addEventListener("click", () => show(dialog));

@@ -1,4 +1,4 @@
-// Lists: the address says what one is narrowed to, without what is empty; and what is done to all that are ticked.
+// Filters of lists (empty values stay out of the address), and actions on all rows that are ticked.
 
 import { post, RequestFailed } from "./api.js";
 import { t } from "./sentences.js";
@@ -8,23 +8,23 @@ document.body.addEventListener("htmx:configRequest", ({ detail }) => {
   for (const [name, value] of [...detail.formData.entries()]) if (!value) detail.formData.delete(name);
 });
 
-const NONE = "00000000-0000-0000-0000-000000000000"; // stands for the uuid in an address
+const NONE = "00000000-0000-0000-0000-000000000000"; // placeholder for the uuid in an address
 
 const episodes = (n) => (n === 1 ? t("page.lists.one_episode", "1 episode") : t("page.lists.episodes", "{n} episodes", { n }));
 
-/** What can be done to several at once, one after the other, each by its own address: what is refused is named. */
+/** Actions on several episodes: one request for each, one after the other; refusals are reported. */
 class Bulk {
   #bar = document.querySelector("[data-bulk]");
   #ticked = new Set();
   #busy = false;
-  #ended = false; // by the one who pressed
-  #undo = []; // of the last change of tags: {value, content}
+  #ended = false; // the user ended the action that is under way
+  #undo = []; // {value, content} that undo the last change of tags
 
   constructor() {
     document.addEventListener("change", ({ target }) => this.#changed(target));
     document.addEventListener("click", ({ target }) => this.#clicked(target));
     document.body.addEventListener("htmx:afterSwap", () => this.#show());
-    for (const box of this.#boxes) this.#tick(box); // before this script was there, or by the browser on the way back
+    for (const box of this.#boxes) this.#tick(box); // boxes that were ticked before this script ran, or that the browser restored on the way back
     this.#show();
   }
 
@@ -49,7 +49,7 @@ class Bulk {
     else this.#ticked.delete(value);
   }
 
-  /** Rows that are new are ticked as those before; those that are gone are ticked no more. */
+  /** Update boxes and buttons: replaced rows keep their ticks, and rows that are gone are no longer chosen. */
   #show() {
     const there = new Set(this.#boxes.map(({ value }) => value));
     for (const value of this.#ticked) if (!there.has(value)) this.#ticked.delete(value);
@@ -67,7 +67,9 @@ class Bulk {
     this.#datasets();
   }
 
-  /** To the page that makes a new dataset of those that are published, one for each dataset that has some. */
+  /**
+   * Offer a link to the page that makes a new dataset of the chosen episodes: one for each dataset that contains some of them.
+   */
   #datasets() {
     const published = new Map();
     for (const { checked, dataset } of this.#boxes) {
@@ -109,7 +111,7 @@ class Bulk {
     this.#show();
   }
 
-  /** What a button sends; null where a tag is missing. */
+  /** Return what a button sends, or "" if it needs a tag and none was typed. */
   #content({ dataset }) {
     const field = (name) => this.#bar.querySelector(`[data-bulk-field][name=${name}]`).value.trim();
     if (dataset.bulkTag) return field("tag") && { [dataset.bulkTag]: [field("tag")] };
@@ -126,7 +128,7 @@ class Bulk {
     this.#show();
   }
 
-  /** True if the person who is asked means it. */
+  /** Resolve to true if the user confirms. */
   #sure(title, words) {
     const dialog = this.#part("sure");
     dialog.querySelector("h2").textContent = t("page.lists.sure", "{title}?", { title });
@@ -139,7 +141,7 @@ class Bulk {
     });
   }
 
-  /** Send `work`, each of value and content; what was answered, by value. */
+  /** Send every {value, content} of `work`; resolve to the answers as [{value, answer}]. */
   async #all(words, address, work) {
     this.#busy = true;
     this.#ended = false;

@@ -1,5 +1,5 @@
-// What every page has: the account's menu, keys, Find, tables that keys can scroll where they are wider than the page.
-// A station's page listens for its keys itself.
+// What every page has: the account's menu, keys, Find, and tables wider than the page that can be scrolled by keyboard. A
+// station's page listens for its keys itself.
 
 import "./find.js";
 import "./sentences.js";
@@ -7,7 +7,7 @@ import { keyboard } from "./keys.js";
 
 const menu = document.querySelector(".bar-user");
 
-// It closes when something else is pressed, or Esc.
+// A click elsewhere or Esc closes the menu.
 if (menu) {
   document.addEventListener("click", (event) => {
     if (!menu.contains(event.target)) menu.open = false;
@@ -15,7 +15,7 @@ if (menu) {
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") menu.open = false;
   });
-  const ofReview = document.getElementById("review-keys"); // a page with keys of its own, which shows them itself
+  const ofReview = document.getElementById("review-keys"); // the review page has keys of its own and shows them itself
   if (ofReview) menu.querySelector("[data-open-keys]").addEventListener("click", () => ofReview.showModal());
   else if (!document.getElementById("estop-area")) keyboard();
 }
@@ -29,9 +29,9 @@ function scrollers() {
 scrollers();
 window.addEventListener("resize", scrollers);
 document.addEventListener("htmx:afterSwap", scrollers);
-document.addEventListener("toggle", scrollers, { capture: true }); // a table may be in details
+document.addEventListener("toggle", scrollers, { capture: true }); // a table may be inside a details element
 
-// Filters apply when one is chosen; the address says what they are, and the keyboard stays where it was.
+// Choosing a filter submits the form. The address contains only filters that are set, and the focus returns to the same field.
 const APPLIED = "applied filter";
 document.addEventListener("change", ({ target }) => {
   const form = target.form;
@@ -44,5 +44,6 @@ const applied = sessionStorage.getItem(APPLIED);
 if (applied) document.querySelector("form[data-applied]")?.elements[applied]?.focus();
 sessionStorage.removeItem(APPLIED);
 window.addEventListener("pageshow", () => {
-  for (const field of document.querySelectorAll("form[data-applied] :disabled")) field.disabled = false; // somebody came back
+  // The user came back with the browser's Back button.
+  for (const field of document.querySelectorAll("form[data-applied] :disabled")) field.disabled = false;
 });

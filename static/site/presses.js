@@ -1,24 +1,26 @@
-// What a person presses: keys, buttons, fingers, pads. For what only the next press may go on with.
+// Every way to press something: keys, buttons, touch, gamepads. For controls whose state ends with the next press of anything
+// else.
 
-/** Told to the window of a pad's button that clicks nothing on the page. */
+/** Event on the window for a gamepad button that clicks no element of the page. */
 export const PRESSED = "eva:press";
 
 /**
- * Have `other()` hear of every press but clicks on an element that is `mine(element)`, and keys that click one. To be called
- * after keys.js and before whatever else clicks by keys listens: a key is another one where none of them has clicked.
+ * Call `other()` on every press except clicks on elements for which `mine(element)` is true and keys that click one of them.
+ * Call this after keys.js and before any other listener that clicks by keys is added: a key counts as another press if no
+ * earlier listener has clicked an element of ours.
  */
 export function otherPresses(mine, other) {
-  let clicked = false; // what is ours, by the key that is down
+  let clicked = false; // true if the key that is down has clicked one of our elements
   const clicks = ({ target }) => {
     clicked = Boolean(mine(target));
     if (!clicked) other();
   };
   const begins = ({ repeat }) => repeat || (clicked = false);
   const ends = ({ key, repeat, target }) => {
-    const comes = /^(Enter| )$/.test(key) && mine(target); // its click, after this
+    const comes = /^(Enter| )$/.test(key) && mine(target); // the browser sends the click after this event
     if (!repeat && !clicked && !comes) other();
   };
-  window.addEventListener("click", clicks, { capture: true }); // before anything says what was pressed
+  window.addEventListener("click", clicks, { capture: true }); // runs before any listener that reports what was pressed
   window.addEventListener("keydown", begins, { capture: true });
   window.addEventListener("keydown", ends);
   window.addEventListener(PRESSED, other);

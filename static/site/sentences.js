@@ -1,31 +1,33 @@
-// Words of the pages in the language that this browser has chosen: by their ids, English without one. Nothing waits for a
-// catalogue: the one of the last page is kept in this browser; when a newer one has come, "eva:language" is told to the
-// document.
+// Texts of the pages in the language chosen in this browser, looked up by id; English if none is chosen. Nothing waits for a
+// catalogue: the one that the last page used is kept in this browser, and when a newer one has arrived, the event
+// "eva:language" is sent to the document.
 
 const COOKIE = "eva_language";
-const KEPT = "eva-language"; // {code, sentences}, as the last page had them
+const KEPT = "eva-language"; // {code, sentences} that the last page used
 const PART = /\{\{|\}\}|\{([a-z][a-z0-9_]*)(!r)?(?::([^{}]*))?\}/g;
 
-const root = globalThis.document?.documentElement; // none where tests run it
+const root = globalThis.document?.documentElement; // undefined in tests, which have no document
 let patterns = {};
 
-/** Speak by these patterns (id -> pattern) from now on; {} is English. */
+/** Use these patterns (id -> pattern) from now on; {} means English. */
 export function speak(found) {
   patterns = found;
   if (root) document.dispatchEvent(new Event("eva:language"));
 }
 
-/** What {id, arguments, text} says: in the chosen language where that has words for it, else its text. */
+/**
+ * Return the text of {id, arguments, text} in the chosen language, or its English `text` if the language has no pattern for it.
+ */
 export function sentence({ id = "", arguments: given = {}, text = "" }) {
   return Object.hasOwn(patterns, id) ? filled(patterns[id], given) ?? text : text;
 }
 
-/** A text of the page: its English, in which {names} stand for what is given, or the words of the chosen language. */
+/** Return a text of the page: `english` with its {names} replaced by `given`, or the text of the chosen language. */
 export function t(id, english, given = {}) {
   return sentence({ id, arguments: given, text: filled(english, given) ?? english });
 }
 
-/** A pattern with what is given; null where it asks for what there is not. */
+/** Return a pattern with its names replaced by `given`, or null if it uses a name that is not given. */
 function filled(pattern, given) {
   let whole = true;
   const said = pattern.replace(PART, (part, name, quoted, spec = "") => {
@@ -36,12 +38,15 @@ function filled(pattern, given) {
   return whole ? said : null;
 }
 
-/** A message with `reason` and the id and arguments of that, with what it says in the chosen language. */
+/** Return a message whose `reason` is in the chosen language; the message also has the id and arguments of its reason. */
 export function reasoned(message) {
   return typeof message.reason === "string" ? { ...message, reason: sentence({ ...message, text: message.reason }) } : message;
 }
 
-/** The snapshot of a station with its texts in the chosen language: those that its "sentences" name, by where they stand. */
+/**
+ * Return a station's snapshot with its texts in the chosen language; its "sentences" maps the path of each such text to its
+ * sentence.
+ */
 export function localized(snapshot) {
   const said = snapshot?.sentences ?? {};
   const found = Object.entries(said).filter(([, { id }]) => Object.hasOwn(patterns, id));
@@ -51,7 +56,7 @@ export function localized(snapshot) {
   return copy;
 }
 
-/** Replace the text at `path`, keys with dots between them, which keys may have themselves. */
+/** Replace the text at `path`: keys joined by dots, where the keys may contain dots themselves. */
 function put(tree, path, one) {
   if (tree === null || typeof tree !== "object") return;
   if (typeof tree[path] === "string") {
@@ -70,7 +75,7 @@ function shown(value, quoted, spec) {
   return /^\.\d+$/.test(spec) ? [...said].slice(0, Number(spec.slice(1))).join("") : said;
 }
 
-/** As Python formats it: ".2f", "g", ".3g", "d"; anything else leaves it as it is. */
+/** Format a number as Python does, for ".2f", "g", ".3g" and "d"; any other format prints it unchanged. */
 function figure(value, spec) {
   const [, digits, kind] = /^(?:\.(\d+))?([fgd])$/.exec(spec) ?? [];
   if (kind === "f") return value.toFixed(digits ?? 6);
@@ -99,6 +104,6 @@ if (root) {
   document.addEventListener("change", ({ target }) => {
     if (!target.matches("[data-language-choice]")) return;
     document.cookie = `${COOKIE}=${target.value}; path=/; max-age=31536000; samesite=lax`;
-    load(target.value).then(() => location.reload()); // it keeps its lease
+    load(target.value).then(() => location.reload()); // the page keeps its lease
   });
 }

@@ -1,5 +1,5 @@
-// Dark or light before anything is drawn: as this browser was told, else dark at the bench, and elsewhere as the system.
-// A classic script, because modules run only after the first paint.
+// Sets the dark or light theme before anything is drawn: as chosen in this browser, else dark at the bench and elsewhere as the
+// system has it. This is a classic script, because modules run only after the first paint.
 (() => {
   const KEY = "eva-theme";
   const root = document.documentElement;

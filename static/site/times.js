@@ -1,4 +1,4 @@
-// Times as templates write them: in the lab's time zone, whatever the browser's is.
+// Times as templates write them: in the lab's time zone, whichever zone the browser has.
 
 const made = {};
 
@@ -8,12 +8,12 @@ function written(moment, style) {
   return made[style].format(new Date(moment));
 }
 
-/** Hours, minutes and seconds of a moment: a Date, milliseconds or an ISO time. */
+/** Return hours, minutes and seconds of a moment: a Date, milliseconds or an ISO time. */
 export function clockTime(moment) {
   return written(moment, "clock");
 }
 
-/** Its day, hours and minutes. */
+/** Return day, hours and minutes of a moment: a Date, milliseconds or an ISO time. */
 export function when(moment) {
   return written(moment, "day");
 }

@@ -1,7 +1,7 @@
-// A command that the station refuses because one of its processes is still starting: asked again for a moment, under the
-// same lease and of the same state, until the person presses something else.
+// A command that the station refuses while one of its processes is starting. It is sent again for a few seconds, as long as
+// lease and state stay the same and the user presses nothing else.
 
-const STARTING = "operations.family_starting"; // the refusal that passes by itself
+const STARTING = "operations.family_starting"; // id of the refusal that ends by itself
 const FOR_MS = 3000;
 const EVERY_MS = 500;
 
@@ -9,16 +9,19 @@ export class Asking {
   #holds;
   #waits;
   #over = false;
-  #wake = null; // while it waits
+  #wake = null; // ends the wait between two attempts; null if none is under way
   #refusal = null;
 
-  /** `holds()`: lease and state are still those it was pressed in; `waits(process)` hears what it waits for. */
+  /**
+   * `holds()` returns whether lease and state are still those at the press; `waits(process)` is called with the process that is
+   * starting.
+   */
   constructor({ holds, waits }) {
     this.#holds = holds;
     this.#waits = waits;
   }
 
-  /** The answer to `ask()`, null where it was ended while it waited; throws what it failed of last. */
+  /** Resolve to the answer of `ask()`, or to null if `end()` was called during a wait; throw the last failure. */
   async answer(ask) {
     const until = performance.now() + FOR_MS;
     for (;;) {
@@ -36,16 +39,16 @@ export class Asking {
       });
       this.#wake = null;
       if (this.#over) return null;
-      // A timer of a tab that was frozen wakes late.
+      // The timer of a tab that was frozen fires late.
       if (performance.now() > until || !this.#holds()) throw this.#refusal;
     }
   }
 
-  /** Ask no more; the refusal that nobody has said yet, null for none. */
+  /** Stop asking. Return the refusal that was not reported yet, or null if there is none. */
   end() {
     if (this.#over) return null;
     this.#over = true;
-    if (!this.#wake) return null; // the answer that is under way says it
+    if (!this.#wake) return null; // the answer under way will report it
     this.#wake();
     return this.#refusal;
   }

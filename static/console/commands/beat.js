@@ -1,3 +1,3 @@
-// A beat each second, also of a page that is hidden: there a browser slows timers of the page itself down to one a minute.
+// Sends a message every second, in a worker: a browser slows the timers of a hidden page down to one per minute.
 
 setInterval(() => postMessage(0), 1000);

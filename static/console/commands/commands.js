@@ -1,4 +1,5 @@
-// Commands: pressed at once, then accepted or done, refused with the reason, or outcome unknown.
+// Commands from button to answer: shown as pressed at once, then as accepted, done, refused with the reason, or outcome
+// unknown.
 
 import { post, RequestFailed } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
@@ -11,19 +12,19 @@ import { commandLabel } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const STATUS = { accepted: t("page.commands.accepted", "accepted"), done: t("page.commands.done", "done") };
-const AT_THE_DESK = ["score", "session"]; // what no robot is needed for
+const AT_THE_DESK = ["score", "session"]; // commands that need no robot
 const STOP_ADVICE = t("page.commands.stop_advice", "Press it again; if the robot still moves, press E-STOP.");
 
-/** Gives commands, says what became of them, and shows which can be given now. */
+/** Sends commands, reports their outcome, and shows which commands can be given now. */
 export class Commands {
   #store;
   #pending = new Set();
-  #givers = new Map(); // kind -> function that says its arguments
+  #givers = new Map(); // kind -> function that returns the arguments of a command
   #stops;
-  #newest = new Map(); // kind of a stop -> uuid of the one that was pressed last
-  #unknown = ""; // uuid of the stop whose unknown outcome the line says
-  #asking = null; // the Resume that is asked again
-  #told = 0; // sentences that stood in the line
+  #newest = new Map(); // kind of stop command -> uuid of its last press
+  #unknown = ""; // uuid of the stop whose unknown outcome is shown
+  #asking = null; // the Resume command that is being retried
+  #told = 0; // number of messages shown so far
 
   constructor(store, socket, way) {
     this.#store = store;
@@ -41,15 +42,18 @@ export class Commands {
     this.gate();
   }
 
-  /** Let `args()` say what goes with every command `kind` that is pressed on this page. */
+  /** Let `args()` provide the arguments of every command `kind` that is pressed on this page. */
   provide(kind, args) {
     this.#givers.set(kind, args);
   }
 
-  /** Send one command, for a trial, a session, an episode to replay or the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
+  /**
+   * Send one command; if given, it names a trial, a session, an episode to replay, or the id of a checkpoint. Resolve to the
+   * answer, or to null if it was not accepted; the page then shows why.
+   */
   async give(kind, args = {}, { trial = null, checkpoint = "", session = "", replay = null } = {}) {
     const name = commandLabel(kind);
-    let told = 0; // when this press last said something
+    let told = 0; // value of #told when this press last showed a message
     const own = (words) => {
       this.say(t("page.common.why", "{name}: {why}", { name, why: words }), "pressed");
       told = this.#told;
@@ -65,8 +69,8 @@ export class Commands {
     if (stops) this.#newest.set(kind, command.uuid);
     try {
       const answer = await (stops ? this.#stops.give(command) : kind === "resume" ? this.#ask(command, own) : post(config.api.commands, command));
-      if (!answer) return null; // another press has ended it, and it was said
-      // That it went well does not cover why a later press was refused.
+      if (!answer) return null; // another press ended this one and reported it
+      // A success must not replace the message why a later press was refused.
       const later = this.#told !== told && ["refused", "unknown"].includes(document.getElementById("outcome").dataset.kind);
       if (stops ? this.#newest.get(kind) === command.uuid : !later) this.say(t("page.common.why", "{name}: {why}", { name, why: STATUS[answer.status] ?? answer.status }), "accepted");
       return answer;
@@ -77,7 +81,7 @@ export class Commands {
     }
   }
 
-  /** Give a command that is asked again while a process of the station is starting. */
+  /** Send a command that is repeated while a process of the station is starting. */
   async #ask(command, own) {
     const { boot, sequence, epoch } = command;
     const holds = () => {
@@ -85,22 +89,25 @@ export class Commands {
       return fresh && lease === "mine" && this.#store.epoch === epoch && snapshot.boot === boot && snapshot.sequence === sequence;
     };
     this.#asking = new Asking({ holds, waits: (process) => own(t("page.commands.waiting", "waiting for the process {process}, trying again …", { process })) });
-    // Under a uuid of its own each time: the station answers one that it knows as it did the first time.
+    // Each attempt has its own uuid: the station answers a uuid that it knows with the first answer.
     return this.#asking.answer(() => post(config.api.commands, { ...command, uuid: uuid() }));
   }
 
-  /** Something else was pressed. */
+  /** Stop retrying Resume because something else was pressed. */
   #askNoMore() {
     const refused = this.#asking?.end();
     if (refused) this.fail(commandLabel("resume"), refused);
   }
 
-  /** The acknowledgement of a stop or pause came over the socket. */
+  /** Take in the acknowledgement of a stop or pause from the socket. */
   acknowledged(ack) {
     this.#stops.acknowledged(ack);
   }
 
-  /** An answer after the page had given up, or has been answered by post: said only where its own is said to be unknown. */
+  /**
+   * Show an answer that came after the page had given up or had been answered by POST, but only if the page still shows this
+   * command's outcome as unknown.
+   */
   #late(ack) {
     if (ack.uuid !== this.#unknown) return;
     const name = commandLabel(ack.kind);
@@ -111,7 +118,7 @@ export class Commands {
     }
   }
 
-  /** Say what went wrong with `name`, and what to do where nobody knows whether it was done. */
+  /** Show what went wrong with the command `name`; if its outcome is unknown, also show `advice`. */
   fail(name, error, advice = t("page.commands.look_first", "Look at the state before you repeat it.")) {
     if (!(error instanceof RequestFailed)) throw error;
     if (error.unknown) this.say(t("page.commands.unknown", "{name}: outcome unknown. {why}. {advice}", { name, why: error.message, advice }), "unknown");
@@ -119,7 +126,7 @@ export class Commands {
     else this.say(t("page.commands.refused", "{name} refused: {why}", { name, why: error.message }), "refused");
   }
 
-  /** The one line in which answers stand. */
+  /** Show an answer in the page's one line for them. */
   say(text, kind) {
     const line = document.getElementById("outcome");
     this.#told += 1;
@@ -128,25 +135,28 @@ export class Commands {
     line.dataset.kind = kind;
   }
 
-  /** Why a score cannot be saved, or a session changed, now: it needs no robot, but it is for who commands to do. */
+  /**
+   * Return why a score cannot be saved, or a session changed, now, or "". Neither needs a robot, but nobody else may command
+   * the station.
+   */
   #deskReason() {
     const { role, fresh, lease } = this.#store;
     if (role === "viewer") return t("page.reasons.viewer", "a viewer watches; an administrator can make you an operator");
     return fresh && lease === "other" ? t("page.reasons.other", "someone else commands the station; ask for it") : "";
   }
 
-  /** Why `kind` cannot be given now, "" where it can. */
+  /** Return why `kind` cannot be given now, or "" if it can. */
   reason(kind) {
     return pageProblem(kind, this.#store);
   }
 
-  /** Enable and disable every button that gives a command; a disabled one says why. */
+  /** Enable or disable every button that gives a command; a disabled button shows the reason. */
   gate() {
     for (const button of document.querySelectorAll("[data-command], [data-gate]")) {
       try {
         this.#gateOne(button);
       } catch (error) {
-        reportError(error); // one button that fails must not keep Stop disabled
+        reportError(error); // an error at one button must not keep Stop disabled
       }
     }
   }
@@ -179,7 +189,7 @@ export class Commands {
   }
 }
 
-/** Give a button its reason for being disabled, or none. */
+/** Disable a button with a reason, or enable it if the reason is "". */
 export function setReason(button, reason) {
   const disabled = String(Boolean(reason));
   if (button.getAttribute("aria-disabled") !== disabled) button.setAttribute("aria-disabled", disabled);
@@ -187,8 +197,8 @@ export function setReason(button, reason) {
 }
 
 /**
- * Arguments that a button has of its own, data-args as JSON, and that it takes from fields:
- * data-arg-NAME="selector"; an empty field is left out.
+ * Return a button's own arguments: data-args as JSON, and the values of fields, named by data-arg-NAME="selector". An empty
+ * field is left out.
  */
 function argsOf(button) {
   const args = JSON.parse(button.dataset.args ?? "{}");

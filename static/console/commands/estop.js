@@ -1,8 +1,9 @@
-// The software e-stop: a button that never moves, Escape, and space. While the robot is idle or ready, or stopped already,
-// space is for a control that has the focus.
-// Escape first closes what is open, unless the robot may move: then it does both. The e-stop waits for nothing: it goes
-// over the socket and to the process for stops at once, under one uuid, which the station carries out once. What is
-// left, plain HTTP to the web, where these say nothing; and red letters where nobody does. estop_state.js has what is true.
+// The software e-stop: a button that never moves, Escape, and Space. While the robot is idle, ready or already stopped, Space
+// goes to the control that has the focus.
+// Escape closes an open dialog or menu, and presses the e-stop unless it has closed one while the robot is certainly at rest.
+// The e-stop waits for nothing: it is sent over the socket and to the process for stops at once, under one uuid, which the
+// station carries out once. If the socket is closed or neither answers, it is posted to the web server as well; if nothing
+// answers, the page says so in red letters. estop_state.js decides what is shown.
 
 import { post } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
@@ -12,9 +13,10 @@ import { t } from "../../site/sentences.js";
 
 const ACK_MS = 500;
 const ASK_MS = 5000;
-const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // what was clicked gives the focus back: keys.js
+const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // keys.js takes the focus away from controls that were clicked
 const AT_REST = ["idle", "ready"];
-const UNACKNOWLEDGED = t("page.estop.unacknowledged", "the software stop was not acknowledged"); // said beforehand: nothing that is pressed waits for words
+// Prepared at load, so that no press waits for a translation.
+const UNACKNOWLEDGED = t("page.estop.unacknowledged", "the software stop was not acknowledged");
 const OPEN = "dialog[open], details[open]:has(> .float)";
 const WORDS = {
   pressed: { kind: "pressed", text: t("page.estop.pressed", "E-stop pressed …") },
@@ -29,11 +31,11 @@ export class EStop {
   #socket;
   #store;
   #way;
-  #presses = new Map(); // uuid -> {ways under way, addresses that are left, why, reason, timer}
+  #presses = new Map(); // uuid -> {ways: requests under way, left: addresses not tried yet, why, reason, timer}
   #state = new EStopState();
   #drawn = "";
-  #again = 0; // when the process for stops is asked once more
-  #early = ""; // what the early script last said of its press
+  #again = 0; // timer of the next request to the process for stops
+  #early = ""; // what the early script last reported of its press
   #note = document.getElementById("estop-note");
   #area = document.getElementById("estop-area");
   #rest = this.#note.dataset.rest;
@@ -50,20 +52,20 @@ export class EStop {
     store.on("ack", (ack) => ack.kind === "estop" && this.acknowledged(ack));
     store.on("snapshot", () => this.#news());
     this.ask();
-    this.#area.dataset.ready = ""; // estop_early.js leaves it to us
+    this.#area.dataset.ready = ""; // from here on estop_early.js does nothing
     startedAfterAll(document.getElementById("outcome"));
   }
 
-  /** Have the process for stops know who is here, before anybody presses; again until it answers: it may be starting. */
+  /** Make the process for stops know this user before anything is pressed; repeat until it answers, as it may be starting. */
   async ask() {
     clearTimeout(this.#again);
     const there = await this.#way.ask();
     this.#area.toggleAttribute("data-second-way", there);
-    clearTimeout(this.#again); // of another one, as where the socket was opened meanwhile
+    clearTimeout(this.#again); // timer of a concurrent call, such as when the socket was opened meanwhile
     if (!there) this.#again = setTimeout(() => this.ask(), ASK_MS);
   }
 
-  /** Press it; `why` is what was pressed. */
+  /** Press the e-stop; `why` names what was pressed. */
   press(why) {
     const id = uuid();
     this.#heed();
@@ -78,9 +80,9 @@ export class EStop {
     if (!sent) this.#postWhatIsLeft(id, press);
   }
 
-  /** An answer of the server came over the socket or by post; of a press that waits no more it changes nothing. */
+  /** Take in an answer of the server, from the socket or by POST; it changes nothing if its press no longer waits for one. */
   acknowledged({ uuid: id, status, reason }) {
-    if (!this.#state.waits(id)) return; // answered already, or released since
+    if (!this.#state.waits(id)) return; // already answered, or released since
     this.#heed();
     if (status !== "accepted" && status !== "done") {
       this.#oneWayFailed(id, reason || t("page.estop.was", "the e-stop was {status}", { status }));
@@ -90,7 +92,7 @@ export class EStop {
     this.#show();
   }
 
-  /** One way has failed; said where it was the last one. */
+  /** Record that one way has failed; report the failure if no other is left. */
   #oneWayFailed(id, reason) {
     const press = this.#presses.get(id);
     press.ways -= 1;
@@ -120,7 +122,10 @@ export class EStop {
     }
   }
 
-  /** News of the station; drawn only where they change something, as a screen reader says whatever is drawn. */
+  /**
+   * Take in a snapshot of the station. Redraw only if it changes something, because a screen reader reads out whatever is
+   * drawn.
+   */
   #news() {
     this.#heed();
     this.#state.snapshot(this.#store.snapshot, now());
@@ -128,7 +133,7 @@ export class EStop {
     if (this.#state.shown.kind !== this.#drawn) this.#show();
   }
 
-  /** Take over what the early script has said of its press, which it goes on to say until something else is drawn. */
+  /** Take over the press of the early script, whose message stays until this module draws another one. */
   #heed() {
     const { early, kind } = this.#area.dataset;
     if (!early || kind === this.#early) return;
@@ -147,7 +152,7 @@ export class EStop {
       this.#presses.delete(id);
     }
     this.#drawn = kind;
-    delete this.#area.dataset.early; // estop_early.js says nothing from here on
+    delete this.#area.dataset.early; // from here on estop_early.js shows nothing
     this.#note.title = reason;
     if (kind) this.#say(WORDS[kind], reason);
     else this.#atRest();
@@ -179,18 +184,21 @@ export class EStop {
   #key(event) {
     const why = this.#isStop(event);
     if (!why) return;
-    if (why === "space") event.preventDefault(); // else the page would scroll
+    if (why === "space") event.preventDefault(); // prevents scrolling of the page
     if (event.repeat) return;
     const closed = why === "Escape" && closeTop();
     if (!closed || !this.#atRestForSure()) this.press(why);
   }
 
-  /** Nothing may begin to move but by a button, or the e-stop is latched: who has the focus of a control types. */
+  /**
+   * Return true if Space may go to the focused control: the e-stop is latched, or the robot is at rest and only a button can
+   * start a motion.
+   */
   #leavesSpace() {
     return this.#state.latched || (this.#store.fresh && AT_REST.includes(this.#store.snapshot.state));
   }
 
-  /** Nothing moves by what this page knows, and it knows it now. */
+  /** Return true if this page's information is current and says that nothing moves. */
   #atRestForSure() {
     return this.#store.fresh && !this.#store.snapshot.state_is.moving;
   }
@@ -200,14 +208,14 @@ export class EStop {
   }
 }
 
-/** Take back that the page has not started. */
+/** Remove the early script's message that the page has not started. */
 function startedAfterAll(outcome) {
   if (outcome?.dataset.late === undefined) return;
   outcome.textContent = "";
   delete outcome.dataset.late;
 }
 
-/** Close what was opened last; whether there was anything. */
+/** Close the last open dialog or menu in the page; return whether one was open. */
 function closeTop() {
   const top = [...document.querySelectorAll(OPEN)].filter((each) => each.checkVisibility()).at(-1);
   if (top instanceof HTMLDialogElement) top.close();

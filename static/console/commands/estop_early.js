@@ -1,12 +1,13 @@
-// The e-stop before the page's modules run, and where they never do: a page that looks as if it could stop the
-// robot must be able to. By plain HTTP, to the web and to the process for stops at once; a classic script, because a module that fails takes all others with it.
+// The e-stop before the page's modules run, or if they never do: a page that looks as if it could stop the robot must be able
+// to. It posts to the web server and to the process for stops at once. This is a classic script, because a module that fails
+// takes all others with it.
 (() => {
-  const LATE_MS = 8000; // by then the modules have taken over, or something is wrong with them
+  const LATE_MS = 8000; // time [ms] after which modules that have not taken over are reported
   const TIMEOUT_MS = 2500;
   const area = document.getElementById("estop-area");
   const note = document.getElementById("estop-note");
   note.dataset.rest = note.innerHTML;
-  const alone = () => !("ready" in area.dataset); // estop.js says when it is there
+  const alone = () => !("ready" in area.dataset); // estop.js sets data-ready when it takes over
 
   function say(kind, text) {
     area.dataset.kind = kind;
@@ -21,7 +22,7 @@
   async function post(origin, content) {
     const answer = await fetch(origin + area.dataset.address, {
       method: "POST",
-      headers: { "Content-Type": "text/plain" }, // which no browser asks another port about first
+      headers: { "Content-Type": "text/plain" }, // a type that a browser sends to another port without a preflight request
       body: JSON.stringify(content),
       credentials: "include",
       redirect: "error",
@@ -33,7 +34,7 @@
 
   async function press(why) {
     const content = { uuid: uuid(), why: `${why} on the page, before it had started` };
-    const last = () => area.dataset.early === content.uuid; // an answer counts for the last press alone
+    const last = () => area.dataset.early === content.uuid; // only the last press shows its answer
     area.dataset.early = content.uuid;
     say("pressed", "E-stop pressed …");
     try {
@@ -55,6 +56,6 @@
     if (!alone()) return;
     const outcome = document.getElementById("outcome");
     outcome.textContent = "This page has not started: reload it. Its e-stop works.";
-    outcome.dataset.late = ""; // which estop.js takes back where it starts after all
+    outcome.dataset.late = ""; // estop.js removes the message if it starts after all
   }, LATE_MS);
 })();

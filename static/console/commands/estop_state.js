@@ -1,22 +1,22 @@
-// What there is to say of the e-stop: presses that wait for an answer, and the latch as the station tells of it. News of
-// the station may be late: what is older than a press, or than an answer, overwrites neither.
+// What to show of the e-stop: presses that wait for an answer, and the latch as the station reports it. A snapshot may arrive
+// late: one that is older than a press or an answer does not override it.
 
-const QUICKEST_S = 1; // the quickest news of this page took no longer
+const QUICKEST_S = 1; // bound on the shortest delay of a snapshot [s]
 
-/** The truth of one page; `now` is this page's clock [s]. */
+/** E-stop state of one page; `now` is this page's clock [s]. */
 export class EStopState {
-  #waiting = new Map(); // uuid -> {at, failed, reason, latched: seen after it, released: seen since}, as pressed
-  #heldAt = null; // when an answer said that the robot is held, until the station's news are as new
+  #waiting = new Map(); // uuid -> {at, failed, reason, latched and released: seen since}, in order
+  #heldAt = null; // time of the answer that the robot is held; null once a snapshot is as recent
   #latched = false;
   #boot = "";
-  #clock = -Infinity; // of the newest news, on the station's clock [s]
-  #ahead = -Infinity; // that clock minus ours, of the quickest news
+  #clock = -Infinity; // time of the newest snapshot on the station's clock [s]
+  #ahead = -Infinity; // station's clock minus this page's clock at the snapshot with the least delay [s]
 
   get latched() {
     return this.#latched;
   }
 
-  /** Whether that press still waits for an answer. */
+  /** Return whether that press still waits for an answer. */
   waits(uuid) {
     return this.#waiting.has(uuid);
   }
@@ -25,13 +25,15 @@ export class EStopState {
     this.#waiting.set(uuid, { at: now, failed: false, reason: "", latched: false, released: false });
   }
 
-  /** It was not acknowledged in time, or not at all; an answer may still come. */
+  /** Mark a press as not acknowledged in time, or as failed; an answer may still come. */
   failed(uuid, reason) {
     const press = this.#waiting.get(uuid);
     if (press) Object.assign(press, { failed: true, reason });
   }
 
-  /** It was carried out: one latch answers all that were pressed before. Of a press that waits no more it says nothing. */
+  /**
+   * Mark a press and all earlier ones as carried out, because one latch answers them all. Ignore a press that no longer waits.
+   */
   answered(uuid, now) {
     const press = this.#waiting.get(uuid);
     if (!press) return;
@@ -39,10 +41,10 @@ export class EStopState {
       this.#waiting.delete(before);
       if (before === uuid) break;
     }
-    if (!press.released) this.#heldAt = now; // else it may have been before the release: the station's news say it
+    if (!press.released) this.#heldAt = now; // otherwise the stop may have preceded the release, and the next snapshot says what is true
   }
 
-  /** News of the station; those that others of the same boot have overtaken say nothing. */
+  /** Take in a snapshot; ignore one that a newer snapshot of the same boot has overtaken. */
   snapshot(news, now) {
     const { boot = "", clock = now, state_is: is } = news;
     if (boot === this.#boot && clock < this.#clock) return;
@@ -59,14 +61,14 @@ export class EStopState {
     if (!this.#latched && this.#heldAt !== null && (released || this.#isAfter(this.#heldAt))) this.#heldAt = null;
   }
 
-  /** {kind, reason}: "failed", "pressed" (the newest press decides), "latched", "held", or "" at rest. */
+  /** {kind, reason}; kind is "failed" or "pressed" (decided by the newest press), "latched", "held", or "" at rest. */
   get shown() {
     const newest = [...this.#waiting.values()].at(-1);
     if (newest) return { kind: newest.failed ? "failed" : "pressed", reason: newest.reason };
     return { kind: this.#latched ? "latched" : this.#heldAt === null ? "" : "held", reason: "" };
   }
 
-  /** Whether the newest news were made after the moment `at` of this page's clock, for sure. */
+  /** Return true if the newest snapshot was certainly made after the moment `at` of this page's clock [s]. */
   #isAfter(at) {
     return this.#clock > at + this.#ahead + QUICKEST_S;
   }

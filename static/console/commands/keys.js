@@ -1,5 +1,5 @@
-// Keys at a station: those of every page, and the focus is never left where Space or a letter would be taken. The
-// stopping keys are in estop.js.
+// Keys on a station's page: those of every page, and no control keeps the focus where it would take Space or a letter. The keys
+// that stop are in estop.js.
 
 import { keyboard as everywhere } from "../../site/keys.js";
 
@@ -7,7 +7,7 @@ export { label, namesOf } from "../../site/keys.js";
 
 const CLICKED = 'button, summary, a[href], select, input[type="checkbox"], input[type="radio"]';
 
-/** What was clicked gives the keys back; a list that is gone through by keys keeps them until Enter. */
+/** Blur controls after a click; a list that is operated by keys keeps the focus until Enter. */
 function released() {
   let byKey = false;
   document.addEventListener("pointerdown", () => (byKey = false), { capture: true });
@@ -22,7 +22,7 @@ function released() {
   }, { capture: true });
 }
 
-/** Listen for keys; `refused` as of every page. */
+/** Listen for keys; `refused` as in keys.js of static/site. */
 export function keyboard(refused) {
   released();
   everywhere(refused);

@@ -1,5 +1,5 @@
-// Who commands: taken, renewed each second, requested, handed over, given up. A page that is hidden says so: it keeps the
-// station while nothing moves and nobody else asks; a run that goes on is held, after a countdown with tones.
+// The controls of the lease: take, renew each second, request, hand over, give up. A hidden page says so when it renews: it
+// keeps the lease while nothing moves and nobody else asks for it. A run in progress is held, after a countdown with tones.
 
 import { post } from "../../site/api.js";
 import { clockTime } from "../../site/times.js";
@@ -28,15 +28,15 @@ export class LeaseControls {
   #socket;
   #commands;
   #hiddenAt = 0;
-  #yields = false; // somebody asks for the station while nobody sees this page
-  #away = ""; // what to say if the lease has ended while this page was hidden; not known yet
+  #yields = false; // another user asks for the station while this page is hidden
+  #away = ""; // message to show if it turns out that the lease ended while this page was hidden
   #tones = null;
   #title = document.title;
   #awake = null;
   #refused = 0;
   #before = "unknown";
-  #mine = false; // this page has commanded, and nothing was heard yet of who does since
-  #heardAt = 0; // when its lease was last renewed
+  #mine = false; // this page has commanded, and it is not known yet that it does not any more
+  #heardAt = 0; // time of the last renewal [ms]
 
   constructor(store, socket, commands) {
     this.#store = store;
@@ -54,14 +54,15 @@ export class LeaseControls {
     this.#draw();
   }
 
-  /** The server answered a renewal; the station's own state says the rest. */
+  /** Take in the answer to a renewal; the snapshot says who has the lease. */
   #renewed({ ok, reason }) {
     this.#refused = ok || this.#store.lease !== "mine" ? 0 : this.#refused + 1;
     if (ok) {
       this.#away = "";
       this.#heardAt = performance.now();
     }
-    if (this.#refused > 1) this.#commands.say(t("page.lease.not_renewed", "Lease not renewed: {reason}", { reason }), "refused"); // once: it was just handed over
+    // A single refusal is normal right after a hand-over.
+    if (this.#refused > 1) this.#commands.say(t("page.lease.not_renewed", "Lease not renewed: {reason}", { reason }), "refused");
   }
 
   #draw() {
@@ -87,7 +88,7 @@ export class LeaseControls {
     this.#renew();
   }
 
-  /** The runtime takes that of a hidden page only while nothing moves. */
+  /** Renew the lease; the runtime accepts a hidden page's renewal only while nothing moves. */
   #renew() {
     if (this.#store.lease !== "mine" || (document.hidden && this.#yields)) return;
     this.#socket.send({ type: "renew", epoch: this.#store.epoch, ...(document.hidden && { hidden: true }) });
@@ -98,7 +99,7 @@ export class LeaseControls {
     window.htmx.trigger("#lease", "eva:lease");
   }
 
-  /** How long until a run is held, in the tab's title, with a tone each second. */
+  /** Show in the tab's title how long until the run is held, with a tone each second. */
   #countDown() {
     const { facts, state_is } = this.#store.snapshot;
     const left = Math.ceil(facts.lease_ttl_s - (performance.now() - this.#hiddenAt) / 1000);
@@ -133,7 +134,7 @@ export class LeaseControls {
   async #act(action, name, content) {
     this.#commands.say(t("page.common.pressed", "{name}: pressed …", { name }), "pressed");
     const mine = this.#mine;
-    if (GIVEN_AWAY.includes(action)) this.#mine = false; // what is given up is not lost
+    if (GIVEN_AWAY.includes(action)) this.#mine = false; // a lease that is given up is not reported as lost
     try {
       await post(config.api.lease, { action, page: this.#store.page, ...content });
       this.#commands.say(t("page.common.done", "{name}: done", { name }), "accepted");
@@ -147,7 +148,10 @@ export class LeaseControls {
     }
   }
 
-  /** A page nobody sees commands no robot that moves: said beforehand on the page, and here in the tab's title. */
+  /**
+   * Start the countdown when this page is hidden, and prepare the message when it is shown again: a hidden page may not command
+   * a robot that moves. The page says so beforehand, and the tab's title meanwhile.
+   */
   #visibility() {
     if (document.hidden) {
       if (this.#store.lease !== "mine") return;
@@ -167,7 +171,7 @@ export class LeaseControls {
     this.#draw();
   }
 
-  /** This page commands no more: said here, with since when and why, but where it gave the station away itself. */
+  /** Report that this page no longer commands, since when and why, unless it gave the station away itself. */
   #ended(lease) {
     if (this.#mine || this.#away) this.#commands.say(this.#away || this.#lost(lease), "refused");
     this.#mine = false;
@@ -188,7 +192,7 @@ export class LeaseControls {
     if (this.#store.lease === "mine" && this.#store.snapshot.state_is.going) event.preventDefault();
   }
 
-  /** A tablet that darkens its screen would hide the page. */
+  /** Keep the screen on: a tablet that turns it off would hide the page. */
   async #stayAwake() {
     if (!("wakeLock" in navigator) || document.hidden) return;
     try {

@@ -1,4 +1,4 @@
-// Why a command cannot be given now, in a sentence. Whether it can is the station's own word: snapshot.allowed.
+// Why a command cannot be given now, in a sentence. The station itself decides whether it can: snapshot.allowed.
 
 import { STOPPING } from "./stops.js";
 import { commandLabel } from "../live/labels.js";
@@ -6,7 +6,10 @@ import { t } from "../../site/sentences.js";
 
 const MODES = { step: t("page.reasons.mode_step", "step or preview"), commit: t("page.reasons.mode_commit", "preview"), cancel: t("page.reasons.mode_cancel", "step, preview or manual"), move: t("page.reasons.mode_move", "manual") };
 
-/** Why this page cannot give `kind` now, "" where it can. To stop it needs no news, only the lease it last had. */
+/**
+ * Return why this page cannot give `kind` now, or "" if it can. A stop does not need a current snapshot, only the lease that
+ * the page last had.
+ */
 export function pageProblem(kind, { fresh, role, lease, snapshot }) {
   if (!fresh) return STOPPING.includes(kind) && lease === "mine" ? "" : t("page.reasons.unknown", "the state of the station is not known at the moment");
   if (role === "viewer") return t("page.reasons.viewer", "a viewer watches; an administrator can make you an operator");
@@ -16,7 +19,10 @@ export function pageProblem(kind, { fresh, role, lease, snapshot }) {
   return commandProblem(kind, snapshot);
 }
 
-/** "" where the station allows `kind`; its own sentence where it is only not allowed just now. */
+/**
+ * Return "" if the station allows `kind`, its own sentence if only a guard forbids it at the moment, else a sentence about the
+ * state.
+ */
 export function commandProblem(kind, { allowed, guarded = {}, state_is: is }) {
   if (allowed.includes(kind)) return "";
   if (guarded[kind]) return guarded[kind];
@@ -25,10 +31,10 @@ export function commandProblem(kind, { allowed, guarded = {}, state_is: is }) {
   return t("page.reasons.not_while", "not while {state}; possible now: {possible}", { state: is.label, possible });
 }
 
-/** Why no preflight of a checkpoint can be asked for now, "" where one can; nobody needs the lease for it. */
+/** Return why no preflight of a checkpoint can be requested now, or "" if one can. A preflight does not need the lease. */
 export function preflightProblem({ fresh, role, snapshot }, checkpoint) {
   if (role === "viewer") return t("page.reasons.viewer", "a viewer watches; an administrator can make you an operator");
   if (!checkpoint) return t("page.reasons.choose", "choose a checkpoint: Set up asks the deployed one");
-  if (!fresh) return ""; // the worker asks where the station does not run
+  if (!fresh) return ""; // without a running station the worker carries out the preflight
   return snapshot?.state_is.at_work ? t("page.reasons.at_work", "not while {state}: the policy is at work", { state: snapshot.state_is.label }) : "";
 }

@@ -1,5 +1,5 @@
-// The way to a stop that no page keeps busy: the process for stops, at a port of its own, or at the web's own address
-// where a proxy leads the e-stop there.
+// The route for stops that no page keeps busy: the process for stops, either on its own port or at the web server's address if
+// a proxy forwards the e-stop to it.
 
 import { get, post, RequestFailed } from "../../site/api.js";
 
@@ -8,13 +8,13 @@ export class StopRoute {
   #paths;
   #alone = false;
 
-  /** `origin` is "" where this page was told of no port; `paths` are those of `estop` and `commands`. */
+  /** `origin` is "" if this page was given no port; `paths` are the paths `estop` and `commands`. */
   constructor(origin, paths) {
     this.#origin = origin;
     this.#paths = paths;
   }
 
-  /** Whether there is one, as far as this page was told. */
+  /** True if this page knows of a process for stops. */
   get there() {
     return Boolean(this.#origin) || this.#alone;
   }
@@ -23,7 +23,7 @@ export class StopRoute {
     return this.#origin + this.#paths.estop;
   }
 
-  /** Ask whether it stands; from then on it knows who presses. */
+  /** Ask whether the process for stops answers; from then on it knows this user. */
   async ask() {
     try {
       this.#alone = (await get(this.estop)).alone === true;
@@ -34,7 +34,10 @@ export class StopRoute {
     return this.#alone;
   }
 
-  /** Give a stop or halt this way too; null where a proxy leads it to the web. */
+  /**
+   * Send a stop or halt by this route too; return null if there is no port for it, because a proxy would lead it to the web
+   * server.
+   */
   post(command) {
     return this.#origin ? post(this.#origin + this.#paths.commands, command) : null;
   }

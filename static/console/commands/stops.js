@@ -1,5 +1,6 @@
-// Stop and pause: over the open socket, which needs no database, and to the process for stops at once; by post under the
-// same uuid where the socket is closed or both say nothing. The station carries out a uuid once, whichever way it came.
+// The commands Stop and Pause: sent over the open socket, which needs no database, and to the process for stops at once; also
+// posted under the same uuid if the socket is closed or neither answers. The station carries out a uuid once, whichever way it
+// came.
 
 import { RequestFailed } from "../../site/api.js";
 import { t } from "../../site/sentences.js";
@@ -7,10 +8,10 @@ import { t } from "../../site/sentences.js";
 const ACK_MS = 500;
 const CARRIED_OUT = ["accepted", "done"];
 
-/** The kinds that go this way; pressed again while the first one is under way, they are sent again. */
+/** Kinds of commands that are sent this way. If one is pressed again while the first is under way, it is sent again. */
 export const STOPPING = ["stop", "halt"];
 
-/** What the server said of a command, or RequestFailed where it was not carried out or nobody knows. */
+/** Return the acknowledgement of a command; throw RequestFailed if it was not carried out or its outcome is unknown. */
 export function answered(ack) {
   if (CARRIED_OUT.includes(ack.status)) return ack;
   const unknown = ack.status === "unknown" || ack.status === "pressed";
@@ -25,8 +26,8 @@ export class Stops {
   #waiting = new Map(); // uuid -> function that takes the acknowledgement
 
   /**
-   * `send(message)` is false where the socket is closed, `beside(command)` null where there is no process for stops;
-   * `late(ack)` hears of answers nobody waits for any more.
+   * `send(message)` returns false if the socket is closed, `beside(command)` null if there is no process for stops; `late(ack)`
+   * is called with answers for which nobody waits any more.
    */
   constructor({ send, beside = () => null, post, late }) {
     this.#send = send;
@@ -35,7 +36,10 @@ export class Stops {
     this.#late = late;
   }
 
-  /** Give `command`; resolves to what was said of it first, whichever way; throws RequestFailed where all have failed. */
+  /**
+   * Send `command`; resolve to the first success, whichever way it comes; throw RequestFailed if all ways have failed. `ackMs`
+   * is the time [ms] after which it is also posted.
+   */
   async give(command, ackMs = ACK_MS) {
     const { kind, uuid, epoch } = command;
     const ack = new Promise((resolve) => this.#waiting.set(uuid, resolve)).then(answered);
@@ -51,7 +55,7 @@ export class Stops {
     }
   }
 
-  /** An acknowledgement came over the socket. */
+  /** Take in an acknowledgement from the socket. */
   acknowledged(ack) {
     const take = this.#waiting.get(ack.uuid);
     if (take) take(ack);
@@ -59,7 +63,7 @@ export class Stops {
   }
 }
 
-/** What the first of them resolves to, or the first one's failure where none does. */
+/** Resolve to the first success, or throw the failure of the first way if all fail. */
 function firstOf(ways) {
   return Promise.any(ways).catch(({ errors }) => {
     throw errors[0];

@@ -1,11 +1,11 @@
-// More joints beside the first: a plot each, which joint it is chosen over it; they pause and hide curves together.
+// Curves of further joints beside the first: a plot each, with a choice of joint above it; all are paused and hidden together.
 
 import { jointOptions } from "../manual/joint_names.js";
 import { Curves } from "./curves.js";
 import { t } from "../../site/sentences.js";
 
-const MOST = 3; // beside the first: further ones are too small to read
-const QUIET = { show() {} }; // marks are told of the first alone
+const MOST = 3; // plots beside the first; more would be too small to read
+const QUIET = { show() {} }; // only the first plot updates the legend of marks
 
 export class Beside {
   #place;
@@ -15,7 +15,9 @@ export class Beside {
   #names = [];
   #grippers = [];
 
-  /** `place`: where the plots are; `key`: of the choice in this browser; `make`: {library, legend} of all of them. */
+  /**
+   * `place` holds the plots, `key` is the key of the choice in localStorage, and `make` has {library, legend} for all plots.
+   */
   constructor({ place, key, ...make }) {
     this.#place = place;
     this.#key = key;
@@ -26,12 +28,12 @@ export class Beside {
     return this.#cells.map(({ curves }) => curves);
   }
 
-  /** True where no other has room. */
+  /** True if there is no room for another plot. */
   get full() {
     return this.#cells.length >= Math.min(MOST, this.#names.length - 1);
   }
 
-  /** The robot's joints are these: with those of them that were chosen before. */
+  /** Use the joints of this robot; those of the kept choice are drawn again. */
   joints(names, grippers) {
     this.#names = names;
     this.#grippers = grippers;
@@ -41,7 +43,7 @@ export class Beside {
     for (const joint of kept.map((name) => names.indexOf(name)).filter((index) => index >= 0)) if (!this.full) this.#draw(joint);
   }
 
-  /** One plot more, of the joint after `joint` and those that are drawn. */
+  /** Add a plot: of the joint after `joint` and all joints already drawn. */
   add(joint) {
     if (this.full) return;
     const drawn = [joint, ...this.#cells.map(({ select }) => select.selectedIndex)];

@@ -1,4 +1,4 @@
-// Which joint is drawn, and whether it stands still; a sentence in its place where uPlot is not installed.
+// Which joint is drawn, and whether the curves are paused; if uPlot is not installed, a sentence takes their place.
 
 import { config } from "../live/config.js";
 import { Legend } from "./curve_legend.js";
@@ -13,7 +13,7 @@ import { t } from "../../site/sentences.js";
 
 const KEY = `eva-joint-${config.station}`;
 
-/** The pane of the curves; resolves to {add(samples), joints(names)}. */
+/** Make the pane of the curves; resolve to {add(samples), joints(names, units, grippers)}. */
 export async function curvePane(store) {
   const note = document.getElementById("curves-note");
   let library;
@@ -70,7 +70,7 @@ function joints(curves, names, units, grippers) {
   return select;
 }
 
-/** One joint more beside those that are drawn, as long as there is room. */
+/** Let the button add a joint beside those that are drawn, as long as there is room. */
 function addButton(beside, select) {
   const button = document.getElementById("curves-add");
   const show = () => button.setAttribute("aria-disabled", String(beside.full));

@@ -1,11 +1,11 @@
-// The legend of the curves: each entry shows and hides its curve, and carries the value at the cursor.
+// The legend of the curves: each entry shows or hides its curve, and shows the value at the cursor.
 
 import { KINDS } from "./curve_kinds.js";
 import { t } from "../../site/sentences.js";
 
-const KEY = "eva-curves-hidden"; // the same choice on every page of this browser
+const KEY = "eva-curves-hidden"; // the choice applies to every page of this browser
 
-/** Fills `element`; `changed(name, shown)` hears of every entry that was pressed. */
+/** Fills `element`; `changed(name, shown)` is called for every entry that is pressed. */
 export class Legend {
   #entries = new Map();
   #hidden = new Set(JSON.parse(localStorage.getItem(KEY) ?? "[]"));
@@ -22,19 +22,19 @@ export class Legend {
     }
   }
 
-  /** Whether the curve of that name is drawn. */
+  /** Return whether the curve of that name is drawn. */
   shown(name) {
     return !this.#hidden.has(name);
   }
 
-  /** Write the value beside the word; NaN is a dash. */
+  /** Write the value beside the word; NaN becomes a dash. */
   value(name, value) {
     const text = Number.isFinite(value) ? value.toFixed(3) : "–";
     const place = this.#entries.get(name).lastElementChild;
     if (place.textContent !== text) place.textContent = text;
   }
 
-  /** Say in place of the meaning why there is nothing to draw. */
+  /** Show why there is nothing to draw, in place of the meaning. */
   explain(name, words) {
     this.#entries.get(name).title = words;
   }

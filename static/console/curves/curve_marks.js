@@ -1,21 +1,24 @@
-// What is drawn with the curves: where a chunk takes over, where chunks overlap, what safety changed. It is found in
-// the samples as they came, before fewer points are drawn: no mark is lost, and each is within one sample of its step.
+// The marks among the curves: where a chunk takes over, where chunks overlap, where safety changed something. They are found in
+// all samples, before the points are thinned out: no mark is lost, and each is within one sample of its step.
 
 import { t } from "../../site/sentences.js";
 
-/** The kinds of marks, in their order in the legend; `title` is the name that is shown, `colour` a custom property, `shape` that of the swatch. */
+/**
+ * The kinds of marks, in their order in the legend. `title` is the name that is shown, `colour` a custom property, `shape` that
+ * of the swatch.
+ */
 export const MARKS = [
   { name: "chunk", title: t("page.curves.chunk", "chunk"), colour: "--mark-chunk", shape: "hairline", means: t("page.curves.chunk_means", "A hairline where another chunk takes over; beside it the chunk at the cursor, 0 for the held target") },
   { name: "overlap", title: t("page.curves.overlap", "overlap"), colour: "--mark-overlap", shape: "patch", means: t("page.curves.overlap_means", "A band where an action combines more than one chunk; beside it, how many at the cursor") },
   { name: "safety", title: t("page.curves.safety", "safety"), colour: "--warn", shape: "tick", means: t("page.curves.safety_means", "A tick where safety changed or refused the action") },
 ];
 
-const SAMPLE_S = 0.1; // how long a sample stands for at most: some come late, and nothing lies between
+const SAMPLE_S = 0.1; // longest time that one sample stands for; samples may be late, and nothing lies between them
 
 /**
- * Of times [s] and the columns of a trace: `seams`, times at which a chunk of the policy begins to lead; `bands`,
- * [from, to] of more than one chunk; `simulations`, [from, to] of what a simulated robot executed; `limits`, times at
- * which safety changed something.
+ * Find the marks in `times` [s] and the columns of a trace. `seams` are times at which a chunk of the policy begins to lead,
+ * `bands` [from, to] where more than one chunk contributes, `simulations` [from, to] where a simulated robot executed, and
+ * `limits` times at which safety changed something.
  */
 export function marks(times, { chunk, chunks, limited, simulated = [] }) {
   const seams = [];
@@ -27,7 +30,7 @@ export function marks(times, { chunk, chunks, limited, simulated = [] }) {
   return { seams, limits, bands: stretches(times, chunks, 2), simulations: stretches(times, simulated, 1) };
 }
 
-/** [from, to] of every stretch of samples in which `numbers` are at least `least`. */
+/** Return [from, to] of every stretch of samples in which `numbers` are at least `least`. */
 function stretches(times, numbers, least) {
   const found = [];
   for (let at = 0; at < numbers.length; at += 1) {

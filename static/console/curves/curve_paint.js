@@ -3,18 +3,18 @@
 import { css } from "./curve_kinds.js";
 import { GHOSTS } from "../scene/scene_ghosts.js";
 
-const TICK = 7; // px high
-const STRIP = 4; // px high
-const MOST_SEAMS = 200; // more of them in a pane would be a surface
+const TICK = 7; // height [px]
+const STRIP = 4; // height [px]
+const MOST_SEAMS = 200; // more hairlines in one plot would look like an area
 
-/** Paints on a plot of uPlot; made anew where the theme changes. */
+/** Paints on a uPlot plot; a new one is made when the theme changes. */
 export class Paint {
   #seam = css("--mark-chunk");
   #band = css("--mark-overlap");
   #limit = css("--warn");
   #simulation = GHOSTS.simulated.colour;
 
-  /** Under the curves. */
+  /** Paint what lies under the curves. */
   behind(plot, { bands, seams }) {
     inside(plot, (ctx, { top, height }) => {
       ctx.fillStyle = this.#band;
@@ -25,7 +25,7 @@ export class Paint {
     });
   }
 
-  /** Over them: what a simulated robot did along the top, what safety changed at the foot. */
+  /** Paint what lies over the curves: executions of a simulated robot along the top, changes by safety at the bottom. */
   over(plot, { limits, simulations }) {
     inside(plot, (ctx, { top, height }) => {
       ctx.fillStyle = this.#simulation;

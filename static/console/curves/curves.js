@@ -1,4 +1,4 @@
-// Curves of one joint over the last seconds: where it is, what the policy wants, what was planned, what was sent.
+// Curves of one joint over the last seconds: its state, what the policy wants, what was planned, what was sent.
 
 import { lastNotAbove } from "../../site/binary_search.js";
 import { KINDS, axes, series, spread } from "./curve_kinds.js";
@@ -9,10 +9,10 @@ import { Trace } from "./trace.js";
 
 const SECONDS = 20;
 const ROWS = 60 * (SECONDS + 2);
-const GAP_S = 0.5; // without news for so long: a gap, not a line
+const GAP_S = 0.5; // time [s] without samples from which there is a gap instead of a line
 const DRAW_MS = 100;
 const WHOLE = [-SECONDS, 0];
-const LEAST_S = 0.2; // of a closer look
+const LEAST_S = 0.2; // shortest time range to zoom into
 const NO_MARKS = { seams: [], bands: [], limits: [], simulations: [] };
 
 export class Curves {
@@ -25,12 +25,12 @@ export class Curves {
   #trace = null;
   #names = [];
   #joint = 0;
-  #span = WHOLE; // of time that is drawn
-  #frozen = null; // the trace as it was when it was paused
+  #span = WHOLE; // time range that is drawn [s]
+  #frozen = null; // copy of the trace while paused
   #frozenAt = 0; // on this page's clock [ms]
   #marks = NO_MARKS;
-  #columns = null; // of the samples that are drawn, with their times
-  #data = [[], ...KINDS.map(() => [])]; // as uPlot has them
+  #columns = null; // columns of the samples that are drawn, with their times
+  #data = [[], ...KINDS.map(() => [])]; // as uPlot takes them
   #addedAt = 0; // on this page's clock [ms]
   #over = new AbortController();
 
@@ -53,12 +53,12 @@ export class Curves {
     this.#build();
   }
 
-  /** It is drawn no more. */
+  /** Stop drawing and release the plot. */
   end() {
     this.#over.abort();
   }
 
-  /** The joints' names, in the order of the vectors. */
+  /** Set the joints' names, in the order of the vectors. */
   joints(names) {
     if (names.join() === this.#names.join()) return;
     this.#names = names;
@@ -67,13 +67,13 @@ export class Curves {
   }
 
   /**
-   * Samples, some of which are known already: {t [s], chunk, chunks, limited, simulated, curves}, columns of one
-   * length and in `curves` by their kinds' names [K * D] numbers; NaN: a gap.
+   * Add samples, some of which may be known already: {t [s], chunk, chunks, limited, simulated, curves}. The columns have one
+   * length K; `curves` has [K * D] numbers for each kind, where NaN is a gap.
    */
   add({ t, curves, ...columns }) {
     const dim = this.#names.length;
     if (!dim || Object.values(curves).some((numbers) => numbers.length !== t.length * dim)) return;
-    if (t.at(-1) < this.#trace.newest - 1) this.#trace.clear(); // another server, another clock
+    if (t.at(-1) < this.#trace.newest - 1) this.#trace.clear(); // another server with another clock
     const sample = {};
     const vectors = {};
     for (let at = 0; at < t.length; at += 1) {
@@ -92,7 +92,7 @@ export class Curves {
     this.#draw(true);
   }
 
-  /** Draw the curve of that name, or leave it out. */
+  /** Show or hide the curve of that name. */
   reveal(name, shown) {
     this.#plot.setSeries(1 + KINDS.findIndex((kind) => kind.name === name), { show: shown });
   }
@@ -101,7 +101,7 @@ export class Curves {
     return this.#frozen !== null;
   }
 
-  /** Stand still to be looked at, joint by joint, while the data goes on. */
+  /** Freeze what is drawn, so that it can be examined joint by joint, while data is still recorded. */
   pause(paused) {
     this.#frozen = paused ? this.#trace.copy() : null;
     this.#frozenAt = performance.now();
@@ -109,17 +109,17 @@ export class Curves {
     this.#draw(true);
   }
 
-  /** How long it has been standing still [s]. */
+  /** How long it has been paused [s]. */
   get pausedFor() {
     return (performance.now() - this.#frozenAt) / 1000;
   }
 
-  /** Whether something that is drawn was executed by a simulated robot. */
+  /** True if part of what is drawn was executed by a simulated robot. */
   get simulated() {
     return this.#marks.simulations.length > 0;
   }
 
-  /** Seconds since something came, where that is worth showing. */
+  /** Seconds since the last sample; 0 if that is too short to show, or while paused. */
   get #silence() {
     const seconds = (performance.now() - this.#addedAt) / 1000;
     return seconds > GAP_S && !this.#frozen ? seconds : 0;
@@ -129,7 +129,7 @@ export class Curves {
     const trace = this.#frozen ?? this.#trace;
     if (!this.#plot || !trace || document.hidden || (this.#frozen && !always)) return;
     if (!Number.isFinite(trace.newest)) return;
-    const now = trace.newest + this.#silence; // without news the curve moves on and nothing follows it
+    const now = trace.newest + this.#silence; // without samples the curves still move on, and nothing follows them
     const { times, values, columns } = trace.joint(this.#joint, now - SECONDS, now);
     this.#marks = marks(times, columns);
     this.#columns = { times, ...columns };
@@ -138,7 +138,7 @@ export class Curves {
     this.#tell();
   }
 
-  /** What is drawn of these columns, NaN as uPlot has it. */
+  /** Fill the plot's data with the thinned columns; NaN becomes null for uPlot. */
   #fill(times, columns) {
     const kept = decimate(columns, 2 * this.#plot.width);
     this.#data.forEach((numbers, index) => {
@@ -148,7 +148,7 @@ export class Curves {
     });
   }
 
-  /** The values under the cursor, else the newest ones; what is old has none. */
+  /** Show the values under the cursor or, without a cursor, the newest; without recent samples there is none. */
   #tell() {
     const at = this.#plot.cursor.idx;
     const chosen = Number.isInteger(at);
@@ -167,7 +167,7 @@ export class Curves {
     return at < 0 ? null : Object.fromEntries(Object.entries(columns).map(([name, numbers]) => [name, numbers[at]]));
   }
 
-  /** While it stands still, a drag looks closer and a double click at everything again. */
+  /** Zoom in to a dragged range while paused; a double click shows everything again. */
   #closer(plot) {
     const { left, width } = plot.select;
     const [from, to] = [left, left + width].map((at) => plot.posToVal(at, "x"));

@@ -1,9 +1,9 @@
-// Fewer points for the same picture: per bucket the smallest and the largest value of every curve, in their
-// order, so that no spike is lost.
+// Fewer points for the same picture: each bucket keeps the smallest and the largest value of every curve, in order, so that no
+// spike is lost.
 
 /**
- * The indices to draw of columns `curves` (arrays of one length, NaN for no value) so that at most about
- * `limit` points remain; all of them where there are fewer.
+ * Return the indices to draw of the columns `curves` (arrays of one length, NaN for no value), so that at most about `limit`
+ * points remain; all indices if there are fewer points.
  */
 export function decimate(curves, limit) {
   const length = curves[0]?.length ?? 0;

@@ -1,4 +1,4 @@
-// What the marks among the curves mean, and what they are at the cursor.
+// The legend of the marks among the curves, with their values at the cursor.
 
 import { MARKS } from "./curve_marks.js";
 import { t } from "../../site/sentences.js";
@@ -6,7 +6,7 @@ import { t } from "../../site/sentences.js";
 export class MarkLegend {
   #values = new Map();
 
-  /** Appends an entry per mark to `element`. */
+  /** Append an entry per mark to `element`. */
   constructor(element) {
     for (const mark of MARKS) {
       const entry = document.createElement("span");
@@ -24,7 +24,7 @@ export class MarkLegend {
     }
   }
 
-  /** Of the sample at the cursor: {chunk, chunks, limited}; nothing where there is none. */
+  /** Show the values of the sample at the cursor {chunk, chunks, limited}; null shows none. */
   show(sample) {
     this.#write("chunk", sample && sample.chunk >= 0 ? String(sample.chunk) : "–");
     this.#write("overlap", sample && sample.chunks > 1 ? t("page.curves.of_chunks", "of {n}", { n: sample.chunks }) : "–");

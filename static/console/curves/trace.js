@@ -1,13 +1,13 @@
-// The last seconds of every joint: a ring of samples, each one vector per kind of curve and what chunks made of it.
+// The last seconds of every joint: a ring of samples, each with one vector per kind of curve and columns about its chunks.
 
-/** What stands beside the curves of a sample, and what it is where nothing is known. */
+/** Columns of a sample besides the curves, with their values if nothing is known. */
 const COLUMNS = { chunk: -1, chunks: 0, limited: 0, simulated: 0 };
 
 export class Trace {
   #times;
   #rows = {};
   #columns = {};
-  #window; // where `joint` writes what it found, so that drawing allocates nothing
+  #window; // buffers for the result of `joint`, so that drawing allocates nothing
   #next = 0;
   #filled = 0;
 
@@ -30,7 +30,7 @@ export class Trace {
     return this.#filled ? this.#times[(this.#next - 1 + this.size) % this.size] : NaN;
   }
 
-  /** Add the sample at time `t` [s]: a vector per kind, none where it has no value there, and its columns. */
+  /** Add the sample at time `t` [s]: a vector per kind, missing for kinds without a value, and its columns. */
   add(t, vectors, columns = {}) {
     if (t <= this.newest) return; // known already
     const at = this.#next;
@@ -49,7 +49,7 @@ export class Trace {
     this.#next = 0;
   }
 
-  /** The same samples, which stay when this one goes on. */
+  /** Return a copy of the samples that does not change when this trace goes on. */
   copy() {
     const twin = new Trace({ dim: this.dim, kinds: Object.keys(this.#rows), rows: this.size });
     twin.#times.set(this.#times);
@@ -61,8 +61,8 @@ export class Trace {
   }
 
   /**
-   * One joint since `from`, oldest first: {times, values: {kind: numbers}, columns: {name: numbers}}; times count
-   * from `zero` [s]. They are overwritten by the next call.
+   * Return one joint since `from` [s], oldest first: {times, values: {kind: numbers}, columns: {name: numbers}}. Times count
+   * from `zero` [s]. The next call overwrites the result.
    */
   joint(index, from, zero = 0) {
     const { times, values, columns } = this.#window;

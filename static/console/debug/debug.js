@@ -1,4 +1,4 @@
-// The Debug page: figures of the station as the runtime measures them.
+// The figures of the Debug page, as the runtime measures them.
 
 import { cameraSummary, cameraProblem } from "../live/camera_text.js";
 import { Distribution } from "./distribution.js";
@@ -6,7 +6,7 @@ import { ikText } from "../scene/ik_text.js";
 import { formatAge, formatFigure } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
-const TELL_MS = 500; // figures that flicker cannot be read
+const TELL_MS = 500; // figures that change too often cannot be read
 const NO_ANSWER = t("page.figures.no_answer", "no answer yet");
 const CONNECTION = t("page.figures.connection", "Connection");
 
@@ -31,7 +31,7 @@ const TEXTS = [
   [t("page.figures.boot", "Boot"), (snapshot) => snapshot.boot],
 ];
 
-/** After which text they stand, their key, their name, what they show, and how. */
+/** Distributions: name of the text they follow, key, name, function that returns the values, and options. */
 const DISTRIBUTIONS = [
   [CONNECTION, "latency", t("page.figures.latency", "Latency"), ({ policy: p }) => p.latencies_ms, { unit: "ms", nothing: NO_ANSWER, narrow: 10 }],
   [CONNECTION, "delay", t("page.figures.delay", "Delay"), ({ policy: p }) => p.delays, { unit: t("page.figures.ticks", "ticks"), nothing: NO_ANSWER, whole: true }],
@@ -45,7 +45,7 @@ function troubled(link) {
   return Object.values(link.cameras ?? {}).some((told) => cameraProblem(told, 0));
 }
 
-/** Fill the list of figures with the newest state, twice a second. */
+/** Fill the list of figures with the newest state, at most twice a second. */
 export function figures(store) {
   const list = document.getElementById("figures");
   if (!list) return;
@@ -61,7 +61,7 @@ export function figures(store) {
   });
 }
 
-/** One figure in words; without words it is not there. */
+/** Add a figure in words; return the function that updates it. It is hidden while its text is empty. */
 function text(list, name, words, weight = "") {
   const { term, value } = entry(list, name);
   if (weight) value.dataset.weight = weight;

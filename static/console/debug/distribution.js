@@ -1,10 +1,10 @@
-// Small distributions: how often which value came, with median and 90th percentile, as a row of bars.
+// Small distributions: a row of bars with median and 90th percentile.
 
 const SVG = "http://www.w3.org/2000/svg";
 const BARS = 24;
 const HEIGHT = 24;
 
-/** The percentile of `values`, which need no order; NaN where there are none. Linear between two values. */
+/** Return the percentile of `values` in any order, interpolated linearly; NaN for no values. */
 export function quantile(values, percent) {
   if (!values.length) return NaN;
   const sorted = [...values].sort((a, b) => a - b);
@@ -15,8 +15,8 @@ export function quantile(values, percent) {
 }
 
 /**
- * How many of `values` fall into each of at most BARS bars: {low, high, counts}. Bars of whole numbers are whole
- * numbers wide. `narrow` is the least range: noise must not look like a spread.
+ * Count how many of `values` fall into each of at most BARS bars: {low, high, counts}. With `whole`, the bars of whole numbers
+ * have a whole width. `narrow` is the least range, so that noise does not look like a spread.
  */
 export function bars(values, { whole = false, narrow = 0 } = {}) {
   let low = Math.min(...values);
@@ -35,7 +35,7 @@ export function bars(values, { whole = false, narrow = 0 } = {}) {
   return { low, high, counts };
 }
 
-/** A distribution as it changes, with its figures beside it. */
+/** A distribution that is updated, with its figures above it. */
 export class Distribution {
   element = document.createElement("div");
   #picture = document.createElementNS(SVG, "svg");
@@ -52,7 +52,7 @@ export class Distribution {
     this.element.append(this.#words, this.#picture, this.#ends);
   }
 
-  /** `values` in `unit`; with none of them `nothing` is said in their place. */
+  /** Show `values` in `unit`; if there are none, show the text `nothing`. */
   show(values, { unit, nothing, digits = 0, whole = false, narrow = 0 }) {
     const key = `${values}`;
     if (key === this.#drawn && this.#words.textContent) return;

@@ -1,9 +1,9 @@
-// The step "Run" of the Debug page: which mode, the one big button of the moment, what is going on.
+// The step "Run" of the Debug page: the mode, the one primary button, and what the run is doing.
 
 import { distanceText, buttonLabels, MODES, phaseText, primaryCommand, proposed, SIM_INPUTS, shown } from "./modes.js";
 import { t } from "../../site/sentences.js";
 
-const SETTLE_MS = 600; // a button that took the place of another is not yet pressed by the hand that pressed that one
+const SETTLE_MS = 600; // Time [ms] for which a button that replaced another ignores presses, which may be meant for the previous one.
 const POLICY_MODES = ["sim", "step", "preview", "continuous"];
 
 export class ModePanel {
@@ -14,21 +14,22 @@ export class ModePanel {
   #primary = "run";
   #changed = -Infinity;
 
-  /** `picked(mode)` hears what a person chose. */
+  /** `picked(mode)` is called when the user chooses a mode. */
   constructor(store, commands, picked) {
     this.#store = store;
     this.#commands = commands;
-    this.#chosen = this.#form.elements.mode.value; // as a draft had it
+    this.#chosen = this.#form.elements.mode.value; // as restored from a draft
     this.#form.addEventListener("submit", (event) => event.preventDefault());
     this.#form.addEventListener("change", (event) => this.#choose(event));
-    this.#form.addEventListener("click", ({ target }) => target.name === "mode" && picked(target.value)); // the same again too
+    // also when the chosen mode is clicked again
+    this.#form.addEventListener("click", ({ target }) => target.name === "mode" && picked(target.value));
     part("seen").addEventListener("change", () => this.draw());
     commands.provide("run", () => this.#runs());
     store.on(["snapshot", "second"], () => this.draw());
     this.draw();
   }
 
-  /** The mode that is shown: of the open run, or of the next one. */
+  /** The mode that is shown: that of the open run, or of the next one. */
   get mode() {
     return this.#form.elements.mode.value;
   }
@@ -61,7 +62,7 @@ export class ModePanel {
       radio.checked = radio.value === mode;
       refuse(radio, open ? t("page.modes.run_open", "the run is open: stop it first") : offered && !offered.includes(radio.value) ? t("page.modes.no_mode", "this station has no such mode") : "");
     }
-    part("seen").hidden = mode !== "sim" || open; // while it runs the note says it
+    part("seen").hidden = mode !== "sim" || open; // while it runs, the note says this
     for (const radio of this.#form.elements.sim_state) {
       if (open && mode === "sim") radio.checked = radio.value === this.#store.snapshot.sim_state;
       refuse(radio, open ? t("page.modes.run_open", "the run is open: stop it first") : "");
@@ -94,7 +95,7 @@ export class ModePanel {
     part("note").dataset.kind = mode;
   }
 
-  /** A first action far from the present pose: a warning, and a choice. */
+  /** Warn about a first action far from the present pose, and offer a choice. */
   #drawFar(snapshot, mode, open) {
     const proposal = open && mode === "preview" ? snapshot.proposal : null;
     const before = !open && snapshot?.state_is.ready && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;

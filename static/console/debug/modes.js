@@ -1,4 +1,4 @@
-// The modes of a run in words: what each does, what can be pressed in it next, what it is doing just now.
+// The modes of a run in words: what each does, what can be pressed next in it, and what the run is doing.
 
 import { stateLabel } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
@@ -13,13 +13,13 @@ export const MODES = {
   collect: t("page.modes.collect", "A person leads the robot; each run is an episode."),
 };
 
-/** What the policy sees in the mode sim, to be said while it runs. */
+/** What the policy sees in the mode sim, shown while it runs. */
 export const SIM_INPUTS = {
   simulated: t("page.modes.seen_simulated", "The policy sees the simulated robot's joints and the live cameras."),
   live: t("page.modes.seen_live", "The policy sees the real robot's joints, which do not follow it, and the live cameras."),
 };
 
-/** The command of the one big button at this moment, "" where none is wanted; `key` of its label in LABELS. */
+/** Return the command of the primary button at this moment. */
 export function primaryCommand({ state_is: is, mode, proposal }) {
   if (is?.held) return "resume";
   if (!is?.going) return "run";
@@ -28,7 +28,7 @@ export function primaryCommand({ state_is: is, mode, proposal }) {
   return mode === "manual" ? "move" : "run";
 }
 
-/** Names of buttons that mean something else in each mode. */
+/** Return the names of the buttons whose meaning depends on the mode. */
 export function buttonLabels(mode) {
   return {
     step: mode === "preview" ? t("page.modes.show_next", "Show next") : t("page.modes.next_chunk", "Next chunk"),
@@ -45,7 +45,7 @@ const PHASES = {
   starved: t("page.modes.starved", "nothing planned: slowing down"),
 };
 
-/** What the run is doing, in words; "" where nothing is open. */
+/** Return what the run is doing, in words; "" if no run is open. */
 export function phaseText({ state_is: is, phase: now, control, rate }) {
   if (!now || !is.at_work) return "";
   if (now !== "executing") return PHASES[now] ?? stateLabel(now);
@@ -53,14 +53,14 @@ export function phaseText({ state_is: is, phase: now, control, rate }) {
   return left > 0 && rate ? t("page.modes.ahead", "executing, {seconds} s ahead", { seconds: (left / rate).toFixed(1) }) : t("page.modes.executing", "executing");
 }
 
-/** How far a chunk's first row, or the policy's first action, is from where the robot is commanded. */
+/** Return in words how far a chunk's first row, or the policy's first action, is from the commanded position. */
 export function distanceText({ distance: far, joint }) {
   if (!Number.isFinite(far)) return "";
   const at = { distance: far.toFixed(2), joint };
   return joint ? t("page.modes.joint_away", "{distance} rad away ({joint})", at) : t("page.modes.away", "{distance} rad away", at);
 }
 
-/** The chunk that is shown, in a sentence. */
+/** Describe the proposed chunk in a sentence. */
 export function proposed(proposal) {
   if (!proposal?.chunk) return "";
   const from = distanceText(proposal);
@@ -69,7 +69,10 @@ export function proposed(proposal) {
   return t("page.modes.chunk", "Chunk {chunk}: {rows} steps{begins}{age}.", { chunk: proposal.chunk, rows: proposal.rows, begins, age });
 }
 
-/** The mode to begin with: the one of the run that is open, what was chosen, what the station does by itself. */
+/**
+ * Return the mode to show: that of the open run, else the chosen one, the station's last one or "continuous", the first of them
+ * that is offered.
+ */
 export function shown({ open, mode, offered }, chosen) {
   if (open && mode) return mode;
   const wanted = [chosen, mode, "continuous"].find((one) => one && (!offered?.length || offered.includes(one)));

@@ -1,6 +1,6 @@
-// Panels of which one is shown at a time; the one that was shown last is shown again after a reload.
+// Panels of which one is shown at a time; a reload shows the same one again.
 
-/** Follow the buttons with data-open-panel; returns {open(name), shown} and tells "eva:panel" on the document. */
+/** Follow the buttons with data-open-panel; return {open(name), shown} and send "eva:panel" on the document at every change. */
 export function panels(element) {
   const key = `eva-panel-${element.dataset.panels}`;
   const buttons = [...element.querySelectorAll("[data-open-panel]")];

@@ -1,4 +1,4 @@
-// Grippers with their state, and what the drives say of themselves.
+// Grippers with their state, and what the drives report.
 
 import { digitsOf, withUnit } from "../curves/units.js";
 import { t } from "../../site/sentences.js";
@@ -8,21 +8,21 @@ const KEYS = [
   { open: "shift+o", close: "shift+c", lock: "shift+l" },
 ];
 
-/** Where a gripper is, in words; `about` has its unit and its range. */
+/** Return where a gripper is, in words; `about` has its unit and range. */
 export function gripperWords({ locked, at }, about = {}) {
   const place = Number.isFinite(at) ? t("page.robot.at", "at {where}", { where: withUnit(at.toFixed(digitsOf(about)), about.unit) }) : "";
   if (!locked) return place || t("page.robot.unknown", "not known");
   return place ? t("page.robot.locked_at", "locked {place}", { place }) : t("page.robot.locked", "locked");
 }
 
-/** What the drives say: {text, weight}. */
+/** Return what the drives report: {text, weight}. */
 export function driveWords(drives) {
   if (!drives || drives.enabled === undefined) return { text: t("page.robot.no_report", "This robot does not report them."), weight: "" };
   if (drives.faults?.length) return { text: t("page.robot.fault", "Fault: {faults}", { faults: drives.faults.join(", ") }), weight: "bad" };
   return drives.enabled ? { text: t("page.robot.enabled", "enabled, no fault"), weight: "good" } : { text: t("page.robot.disabled", "disabled: the robot does not follow"), weight: "warn" };
 }
 
-/** Keeps the panel true; `about(facts, name)` is what is known of the gripper of the group `name`. */
+/** Keep the panel up to date; `about(facts, name)` returns unit and range of the gripper of the group `name`. */
 export function robotPanel(store, commands, about) {
   const list = document.getElementById("grippers");
   const rows = new Map();

@@ -1,10 +1,10 @@
-// The strategy's parameters: what they are called, what they cost, what differs from what is in force.
+// The strategy's parameters: their names, their cost, and how edits differ from what is in force.
 
 import { t } from "../../site/sentences.js";
 
 const STEPS = t("page.tuning.steps", "steps");
 
-/** In the order they are shown. `none` says what an empty field means; without it a number is needed. */
+/** In the order they are shown. `none` says what an empty field means; without it a number is required. */
 export const PARAMETERS = {
   execution_horizon: { label: t("page.tuning.horizon", "Horizon"), unit: STEPS, whole: true, min: 1, none: t("page.tuning.whole_chunk", "whole chunk"), title: t("page.tuning.horizon_title", "Rows of each chunk that may be executed, counted from its observation") },
   inference_rate: { label: t("page.tuning.ask_at", "Ask at"), unit: "Hz", min: 0.1, none: t("page.tuning.back_to_back", "back to back"), title: t("page.tuning.ask_title", "Requests to the policy per second") },
@@ -16,13 +16,13 @@ export const PARAMETERS = {
   delay_quantile: { label: t("page.tuning.quantile", "Delay quantile"), min: 0.01, max: 1, title: t("page.tuning.quantile_title", "Quantile of recent delays that is predicted for the next answer") },
 };
 
-/** What a field shows for a value in force. */
+/** Return the text of a field for a value in force. */
 export function text(name, value) {
   const { empty = null } = PARAMETERS[name];
   return value === empty || value === null || value === undefined ? "" : String(value);
 }
 
-/** What a field's text stands for: {value}, or {error} in a sentence. */
+/** Parse a field's text: {value}, or {error} as a sentence. */
 export function read(name, typed) {
   const { label, choices, none, empty = null, whole, min, max } = PARAMETERS[name];
   const given = typed.trim();
@@ -37,7 +37,10 @@ export function read(name, typed) {
   return { error: t("page.tuning.wrong", "{label}: {range}{open}; given {given}", { label, range, open, given }) };
 }
 
-/** What of the `fields` {name: text} differs from the section `inForce`: {changes, error}. `uses` are the kind's own. */
+/**
+ * Return how `fields` {name: text} differ from the strategy `inForce`: {changes, error}. `uses` names the parameters of this
+ * kind.
+ */
 export function changes(kind, fields, inForce, uses) {
   const found = kind === inForce.kind ? {} : { kind };
   for (const name of uses) {
@@ -48,7 +51,7 @@ export function changes(kind, fields, inForce, uses) {
   return { changes: found, error: "" };
 }
 
-/** What a change of mind of the policy costs with these parameters, in a sentence. */
+/** Return a sentence: with these parameters, what it costs when the policy changes its mind. */
 export function cost(kind, parameters, rate) {
   if (kind === "sync") return t("page.tuning.cost_sync", "The robot stands while the policy is asked.");
   if (kind === "ensemble") return t("page.tuning.cost_ensemble", "Up to {n} chunks are averaged: the robot follows a change of mind late, and never at once.", { n: parameters.ensemble_horizon });

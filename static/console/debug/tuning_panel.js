@@ -1,4 +1,4 @@
-// Prompt and strategy: what is in force, what is edited, applied with one press before or while it runs.
+// Prompt and strategy: what is in force and what is edited; one press applies the edits, before or during a run.
 
 import { changes, cost, PARAMETERS, read, text } from "./tuning.js";
 import { t } from "../../site/sentences.js";
@@ -10,8 +10,8 @@ export class TuningPanel {
   #task = document.getElementById("task");
   #choice = document.getElementById("task-choice");
   #fields = new Map(); // name of a parameter -> its field
-  #edited = new Set(); // names that a person has changed, "kind" among them
-  #known = ""; // the tasks and kinds that are offered
+  #edited = new Set(); // names of parameters the user has changed; "kind" for the strategy
+  #known = ""; // the tasks and kinds that are offered, as JSON
 
   constructor(store, commands) {
     this.#store = store;
@@ -65,7 +65,7 @@ export class TuningPanel {
   #take() {
     this.#task.value = this.#choice.value;
     this.#choice.selectedIndex = 0;
-    this.#task.dispatchEvent(new Event("input", { bubbles: true })); // a draft, too
+    this.#task.dispatchEvent(new Event("input", { bubbles: true })); // saves it as a draft too
   }
 
   #undo() {
@@ -83,7 +83,7 @@ export class TuningPanel {
     this.draw();
   }
 
-  /** What Apply would send: {args, error, words}. */
+  /** Return what Apply would send: {args, error, words}. */
   #wanted() {
     const { snapshot } = this.#store;
     const typed = Object.fromEntries([...this.#fields].map(([name, field]) => [name, field.value]));
@@ -129,7 +129,7 @@ export class TuningPanel {
     this.#task.placeholder = task ? t("page.tuning.as_deployed", "as deployed") : t("page.tuning.what_to_do", "what the robot is to do");
   }
 
-  /** What nobody edits shows what is in force. */
+  /** Show what is in force in all fields that are not edited. */
   #show() {
     const inForce = this.#inForce;
     if (!this.#edited.has("kind") && this.#kind.value !== inForce.kind) this.#kind.value = inForce.kind;

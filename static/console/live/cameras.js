@@ -1,11 +1,11 @@
-// Pictures of the cameras, drawn from one JPEG each; what is old goes grey and says how old it is.
+// Live pictures of the cameras, each from one JPEG; an old picture turns grey and shows its age.
 
 import { cameraSource, cameraProblem } from "./camera_text.js";
 import { formatAge } from "./labels.js";
 import { t } from "../../site/sentences.js";
 
-const STALE_S = 0.5; // as the runtime's own bound on pictures
-const SLOW = 0.8; // of the fastest camera's rate
+const STALE_S = 0.5; // age [s] from which a picture is old: the runtime's own limit for pictures
+const SLOW = 0.8; // share of the fastest camera's rate below which a camera is slow
 const WINDOW_MS = 2000;
 const TELL_MS = 500;
 const NONE = new Uint8Array(0);
@@ -23,16 +23,16 @@ class Camera {
     this.troubleText.className = "camera-trouble";
     this.troubleText.hidden = true;
     this.canvas.addEventListener("contextlost", () => this.forget());
-    this.canvas.addEventListener("contextrestored", () => this.forget()); // it comes back blank
+    this.canvas.addEventListener("contextrestored", () => this.forget()); // a restored canvas is blank
     this.forget();
-    this.drawn = []; // when the last pictures were drawn
+    this.drawn = []; // times of the last draws [ms]
     this.drawnAny = false;
   }
 
-  /** Nothing is on the screen. */
+  /** Forget all pictures: the canvas shows nothing. */
   forget() {
     this.decoded = NONE; // the JPEG that was decoded last
-    this.shown = NONE; // the one that is on the screen
+    this.shown = NONE; // the JPEG that is on the screen
     this.capturedAt = -Infinity; // on this page's clock [ms]
   }
 
@@ -47,13 +47,13 @@ class Camera {
     this.confirm(seconds);
   }
 
-  /** The picture of these bytes, which was decoded before, was captured so many seconds ago. */
+  /** Take in that the last decoded picture, of these bytes, was captured again `seconds` ago. */
   again(bytes, seconds) {
     if (this.shown === bytes) this.confirm(seconds);
-    else this.tell(performance.now()); // it is no picture, or not drawn yet
+    else this.tell(performance.now()); // it is not a picture, or not drawn yet
   }
 
-  /** What is on the screen was captured so many seconds ago. */
+  /** Record that the picture on the screen was captured `seconds` ago. */
   confirm(seconds) {
     const now = performance.now();
     if (this.context.isContextLost?.()) {
@@ -66,7 +66,7 @@ class Camera {
     this.tell(now);
   }
 
-  /** Age and staleness at `now`, without news. */
+  /** Show age and staleness at `now` [ms], without a new picture. */
   tell(now) {
     const seconds = (now - this.capturedAt) / 1000;
     const stale = !(seconds < STALE_S);
@@ -76,13 +76,16 @@ class Camera {
     if (stale) this.freshText.textContent = "";
   }
 
-  /** Pictures that this page drew per second. */
+  /** Return how many pictures per second this page draws. */
   shownRate(now) {
     while (this.drawn.length && now - this.drawn[0] > WINDOW_MS) this.drawn.shift();
     return (this.drawn.length * 1000) / WINDOW_MS;
   }
 
-  /** How a camera of the station's own is, `told` by the runtime at its `clock` [s]; nothing of any other. */
+  /**
+   * Show the condition of a station's own camera from the runtime's report `told`, at the runtime's `clock` [s]; without a
+   * report, show nothing.
+   */
   health(told, clock) {
     const wrong = cameraProblem(told, clock);
     const text = wrong ? t("page.common.why", "{name}: {why}", { name: wrong.word, why: wrong.reason }) : "";
@@ -106,7 +109,10 @@ class Camera {
   }
 }
 
-/** A simulated camera whose bench stands still sends the same JPEG again and again: decoding it is most of the work. */
+/**
+ * Return true if two JPEGs are equal. A simulated camera of a bench at rest sends the same JPEG again and again, and decoding
+ * is most of the work.
+ */
 function equal(one, other) {
   return one.length > 0 && one.length === other.length && one.every((byte, at) => byte === other[at]);
 }
@@ -132,7 +138,7 @@ export class Cameras {
     return [...this.#cameras.keys()].map((name) => `camera/${name}`);
   }
 
-  /** Decode the pictures of a frame; resolves to a function that puts them on the screen. */
+  /** Decode the pictures of a frame; resolve to a function that draws them. */
   async prepare(frame) {
     const ready = [];
     for (const [stream, place] of Object.entries(frame.header.streams)) {
@@ -149,7 +155,7 @@ export class Cameras {
       ready.push(
         createImageBitmap(blob).then(
           (picture) => () => camera.draw(picture, bytes, place.age ?? 0),
-          () => () => camera.tell(performance.now()), // not a picture: the one before grows old
+          () => () => camera.tell(performance.now()), // not a picture: the previous one stays and its age grows
         ),
       );
     }
@@ -157,7 +163,7 @@ export class Cameras {
     return () => draws.forEach((draw) => draw());
   }
 
-  /** Those that the station does not have are away. */
+  /** Hide cameras that the station does not have. */
   #keep(names) {
     for (const camera of this.#cameras.values()) camera.figure.hidden = !names.includes(camera.name);
     const shown = [...this.#cameras.values()].filter(({ figure }) => !figure.hidden).length;
@@ -166,7 +172,7 @@ export class Cameras {
 
   #measured({ rates, ages, cameras = {} }, clock = NaN) {
     const now = performance.now();
-    if (now - this.#told < TELL_MS) return; // figures that flicker cannot be read
+    if (now - this.#told < TELL_MS) return; // figures that change too often cannot be read
     this.#told = now;
     const fastest = Math.max(0, ...[...this.#cameras.keys()].map((name) => rates[name] ?? 0));
     for (const camera of this.#cameras.values()) {

@@ -1,4 +1,4 @@
-// What the server says of this page: addresses, names, role. Read once.
+// What the server tells this page: addresses, names, role. Read once.
 const element = document.getElementById("config");
 
 export const config = element ? JSON.parse(element.textContent) : {};

@@ -1,14 +1,16 @@
-// One frame of the live socket onto the page: the newest of every stream, pictures and numbers of one moment.
+// Draws one frame of the live socket: the newest message of every stream, so that pictures and numbers are from one moment.
 
-const CURVES = { measured: "state", raw: "raw", planned: "smoothed", executed: "executed" }; // of stream "recent", as drawn
-const SOFTWARE_FRAME_MS = 60; // a browser without a graphics card shares the processor with the robot's programs
+// Curves of the stream "recent" -> names under which they are drawn.
+const CURVES = { measured: "state", raw: "raw", planned: "smoothed", executed: "executed" };
+// Shortest time between frames [ms] in a browser without a graphics card, which shares the processor with the robot's programs.
+const SOFTWARE_FRAME_MS = 60;
 
 const nothing = { poses() {}, bench() {}, chunk() {}, aim() {}, add() {}, joints() {}, software: false };
 
-/** The panes that need time to load; until then their data goes nowhere. */
+/** The panes that take time to load; until they have loaded, their data is dropped. */
 export const panes = { scene: nothing, curves: nothing };
 
-/** Draw it; resolves when it is on the screen, which earns the next one. */
+/** Draw a frame; resolve when it is on the screen, and the server may send the next one. */
 export async function drawFrame(frame, store, cameras) {
   const { streams } = frame.header;
   const showPictures = await cameras.prepare(frame);
@@ -26,7 +28,7 @@ function onScreen() {
   return new Promise((resolve) => requestAnimationFrame(resolve));
 }
 
-let due = 0; // when the next frame may be asked for, on this page's clock [ms]
+let due = 0; // earliest time at which to ask for the next frame, on this page's clock [ms]
 
 function pace() {
   const now = performance.now();

@@ -1,11 +1,12 @@
-// Events in words: the runtime's kinds and sentences as a person reads them, and how much they weigh.
+// Events in words: texts for the runtime's kinds and sentences, and their severity.
 
 import { sentence as translated, t } from "../../site/sentences.js";
 import { commandLabel, stateLabel } from "./labels.js";
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "implausible", "corrected", "too_far", "node_silent", "leader_lost"]);
 const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "recording_late", "chunk_dropped", "ik_unreached", "poses_refused", "joints_missing", "not_journalled", "unmeasured", "zero_joints", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
-const GOOD = new Set(["camera_back", "commands_heard", "joints_back", "pictures_back", "policy_back", "recording_goes_on", "recovered", "punctual", "released"]); // a trouble is over
+// Kinds that report the end of a trouble.
+const GOOD = new Set(["camera_back", "commands_heard", "joints_back", "pictures_back", "policy_back", "recording_goes_on", "recovered", "punctual", "released"]);
 const NAMES = {
   camera_absent: t("page.events.camera_absent", "camera absent"),
   camera_back: t("page.events.camera_back", "camera is back"),
@@ -77,10 +78,10 @@ const NAMES = {
   preflight: t("page.events.preflight", "preflight"),
   state: t("page.events.state", "state"),
 };
-const UUID = /\b([0-9a-f]{8})-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b/g; // its beginning is enough to read
-const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a person
+const UUID = /\b([0-9a-f]{8})-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b/g; // the first eight digits are enough to read
+const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a user
 
-/** Sentences that begin with a word of the runtime's, with the one that the page has for it. */
+/** Kinds whose sentences begin with a word of the runtime, with the function that replaces it by the page's word. */
 const PLAIN = {
   state: (said) => said.replace(/^\w+ -> \w+/, stateLabel),
   command: (said) => said.replace(/^\w+(?= by )/, commandLabel),
@@ -89,12 +90,12 @@ const PLAIN = {
   episode_opened: (said) => said.replace(/^recording /, "begun: "),
 };
 
-/** The kind in words. */
+/** Return the name of an event's kind. */
 export function kindLabel(kind) {
   return NAMES[kind] ?? (kind.startsWith("source_") ? NAMES.source_failed : stateLabel(kind));
 }
 
-/** The sentence, with arrows as arrows and people by their names, commands as their buttons say them. */
+/** Return an event's sentence, with arrows as symbols, holders by their names, and commands as their buttons name them. */
 export function eventText(event) {
   const { kind, text } = event;
   const said = translated(event);
@@ -103,7 +104,10 @@ export function eventText(event) {
   return (said === text ? english(said) : said).replaceAll(" -> ", " → ").replace(HOLDER, t("page.events.page_of", "$1 (page $2)")).replace(UUID, "$1");
 }
 
-/** "bad" for what endangers robot or record, "warn" for what a person should have seen, "good" where that is over, else "". */
+/**
+ * Return "bad" if an event endangers robot or record, "warn" if a person should notice it, "good" if it ends a trouble, else
+ * "".
+ */
 export function severity({ kind, text, data = {} }) {
   if (BAD.has(kind) || (kind === "state" && data.state_is?.latched)) return "bad";
   if (WARN.has(kind) || kind.startsWith("source_")) return "warn";

@@ -1,4 +1,4 @@
-// The station's events, newest first: the sentences of its log, without gaps, filtered by words.
+// The station's log: its events as sentences, newest first, without gaps, with a filter by words.
 
 import { clockTime } from "../../site/times.js";
 import { kindLabel, eventText, severity } from "./event_text.js";
@@ -12,7 +12,7 @@ export class Events {
   #count = document.getElementById("events-count");
   #boot = "";
   #newest = 0;
-  #covered = false; // some are kept from who looks
+  #covered = false; // some events are hidden from this user
   #rows = new WeakMap(); // row -> its event
 
   constructor() {
@@ -21,20 +21,20 @@ export class Events {
     this.#show();
   }
 
-  /** The number of the newest event there is here, to ask for what comes after it. */
+  /** Number of the newest event in the list, to request what comes after it. */
   get newest() {
     return this.#newest;
   }
 
-  /** The boot of the runtime that they are of. */
+  /** Boot of the runtime that the events belong to. */
   get boot() {
     return this.#boot;
   }
 
-  /** `covered`: some are kept from who looks, so that numbers are missing. */
+  /** Add events; `covered` is true if some are hidden from this user, so that numbers are missing. */
   add({ boot, events, covered = false }) {
     if (covered !== this.#covered) {
-      // Other numbers: all of them come once more.
+      // The numbers differ then, and all events are sent once more.
       this.#covered = covered;
       this.#newest = 0;
       this.#list.replaceChildren();
@@ -77,7 +77,7 @@ export class Events {
     return row;
   }
 
-  /** Another language was chosen, or its words have come. */
+  /** Translate all rows again, after another language was chosen or its catalogue has arrived. */
   #translate() {
     for (const row of this.#list.querySelectorAll(".event")) {
       const event = this.#rows.get(row);

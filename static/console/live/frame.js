@@ -1,23 +1,26 @@
-// The binary layout of evaweb/core/binary_frames.py: u32 little-endian header length, UTF-8 JSON header, and from the next
-// multiple of 8 on the body; offsets in the header count from the start of the body.
+// Binary frames as evaweb/core/binary_frames.py lays them out: header length as little-endian u32, JSON header in UTF-8, and
+// the body from the next multiple of 8 on. Offsets in the header count from the start of the body.
 
 const ARRAYS = { f4: Float32Array, f8: Float64Array, i4: Int32Array, i8: BigInt64Array, u1: Uint8Array };
 
-/** A message that is not a frame. */
+/** Error for a message that is not a frame. */
 export class BadFrame extends Error {}
 
 function count(shape) {
   return shape.reduce((product, size) => product * size, 1);
 }
 
-/** A view on the numbers that `place` {offset, dtype, shape} describes behind `body`; nothing is copied. */
+/**
+ * Return a view of the numbers that `place` {offset, dtype, shape} describes in the body, which starts at byte `body` of
+ * `buffer`; nothing is copied.
+ */
 export function numbers(buffer, body, place) {
   const kind = ARRAYS[place.dtype.replace(/^[<|=]/, "")];
   if (!kind) throw new BadFrame(`numbers of type ${place.dtype}; known: ${Object.keys(ARRAYS).join(", ")}`);
   return new kind(buffer, body + place.offset, count(place.shape));
 }
 
-/** {header, bytes(place), numbers(place)} of a message. */
+/** Decode a message into {header, bytes(place), numbers(place)}; throw BadFrame if it is not a frame. */
 export function decode(buffer) {
   if (buffer.byteLength < 4) throw new BadFrame(`a frame of ${buffer.byteLength} bytes`);
   const length = new DataView(buffer).getUint32(0, true);

@@ -1,4 +1,5 @@
-// Words for what the station says; the states, what they mean (`state_is`) and what is allowed in them are the runtime's.
+// Words for what the station reports. The states, their meanings (`state_is`) and the commands allowed in them are defined by
+// the runtime.
 
 import { t } from "../../site/sentences.js";
 
@@ -20,12 +21,12 @@ const ADVICE = {
   },
 };
 
-/** What a state asks of the person at the bench; undefined where the station can be left alone. */
+/** Return what a state asks of the person at the bench, or undefined if the station can be left alone. */
 export function advice({ connected, held, latched }) {
   return latched ? ADVICE.latched : held ? ADVICE.held : connected === false ? ADVICE.away : undefined;
 }
 
-/** Why the server closes the socket of a page, by its code. */
+/** Why the server closes a page's socket: close code -> {word, reason}. */
 export const CLOSE_REASONS = {
   4401: { word: t("page.words.logged_out", "logged out"), reason: t("page.words.logged_out_why", "You are logged out: reload this page and log in again.") },
   4404: { word: t("page.words.no_station", "no such station"), reason: t("page.words.no_station_why", "This station is not in the lab any more: go back to the list of stations.") },
@@ -76,7 +77,7 @@ export function formatAge(seconds) {
   return seconds < 100 ? `${seconds.toFixed(1)} s` : `${Math.round(seconds / 60)} min`;
 }
 
-/** A figure with its unit, or a dash where there is none. */
+/** Format a figure with its unit; a value that is not finite becomes a dash. */
 export function formatFigure(value, digits, unit) {
   return Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : `– ${unit}`;
 }

@@ -1,15 +1,15 @@
-// The one websocket of a page: opened again whenever it breaks, credits paid for frames that were drawn.
+// The one websocket of a page: reopened whenever it breaks, with a credit sent for each frame that was drawn.
 
 import { BadFrame, decode } from "./frame.js";
 
-const WAITS_MS = [250, 500, 1000, 2000, 4000]; // before the next try
-const SILENCE_MS = 6000; // an open socket on which nothing comes for so long, though it should, is dead
-const ASK_MS = 2000; // how often the server hears that this page still reads
+const WAITS_MS = [250, 500, 1000, 2000, 4000]; // waits before each further attempt to connect
+const SILENCE_MS = 6000; // silence [ms] after which an open socket that should carry messages counts as dead
+const ASK_MS = 2000; // interval [ms] at which the server is told that this page still reads
 
 /**
- * `told(message)` hears every JSON message, `draw(frame)` every frame and returns when it is on the screen,
- * `changed(open, code)` that the connection is there or gone, with the server's code for it; `greet()` says what is wanted; `expected()` whether
- * frames should be coming.
+ * Websocket of a page. `told(message)` is called with every JSON message. `draw(frame)` is called with every frame and resolves
+ * when it is on the screen. `changed(open, code)` is called when the connection opens or closes, with the server's close code.
+ * `greet()` requests what the page needs; `expected()` returns whether messages should be arriving.
  */
 export class LiveSocket {
   #address;
@@ -39,7 +39,7 @@ export class LiveSocket {
     return this.#socket?.readyState === WebSocket.OPEN;
   }
 
-  /** Send a JSON message; false where there is no connection. */
+  /** Send a JSON message; return false if there is no connection. */
   send(message) {
     if (!this.open) return false;
     this.#socket.send(JSON.stringify(message));

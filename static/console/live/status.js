@@ -1,4 +1,4 @@
-// The status bar and the box that says what a person has to do: state by place, not by pop-up.
+// The status bar and the box that says what a person has to do: state is shown in a fixed place, never in a pop-up.
 
 import { badge } from "./badge.js";
 import { advice, formatAge, formatDuration, formatFigure, stateLabel } from "./labels.js";
@@ -11,7 +11,7 @@ function write(name, text) {
   for (const element of shown(name)) if (element.textContent !== text) element.textContent = text;
 }
 
-/** Keeps the bar true: as news come, and each second for what grows old without news. */
+/** Update the bar with every message, and each second for values that age without one. */
 export function statusBar(store) {
   const draw = () => {
     document.body.toggleAttribute("data-stale", !store.fresh && store.snapshot !== null);
@@ -36,7 +36,7 @@ function drawState(store) {
   write("clock", running ? formatDuration(snapshot.run.elapsed) : "");
 }
 
-/** Why nothing is known, in a word and in a sentence. */
+/** Return {word, reason}: why nothing is known about the station. */
 function trouble(store) {
   if (store.closed) return store.closed;
   if (!store.open) return { word: t("page.status.no_connection", "no connection"), reason: t("page.status.no_connection_why", "The web server does not answer; this page tries again by itself.") };
@@ -91,7 +91,7 @@ function drawFigures(store, snapshot) {
   write("recording", (uuid ? t("page.status.recording", "recording {rows} rows, {repeated} with a repeated picture", { rows, repeated }) : t("page.status.not_recording", "not recording")) + waits);
 }
 
-/** How far the set-up is, or what an idle station waits for: the reason why a set-up failed among it. */
+/** Show the stage of the set-up or, for an idle station, what it waits for, such as why a set-up failed. */
 function drawStage({ state_is: is, stage, reason }) {
   const text = is.preparing ? t("page.status.stage", "{stage} …", { stage: stateLabel(stage) }) : is.idle ? reason : "";
   write("stage", text);
@@ -101,7 +101,7 @@ function drawStage({ state_is: is, stage, reason }) {
   }
 }
 
-/** The latency as a small distribution: a bar to the 90th percentile with a mark at the median. */
+/** Show the latency as a small distribution: a bar up to the 90th percentile with a mark at the median. */
 function drawPolicy(policy) {
   for (const element of shown("policy")) element.toggleAttribute("data-lost", Boolean(policy.lost));
   if (policy.lost) {

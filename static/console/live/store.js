@@ -1,8 +1,12 @@
-// What this page knows of its station: the newest of everything, and who wants to hear of it.
+// What this page knows of its station: the newest message of every kind, and the listeners for each.
 
 import { localized, t } from "../../site/sentences.js";
 
-/** Names told: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello", "second"; answers of the web: "ack", "renewed", "aimed"; "changed", with the names of what has in the database. */
+/**
+ * Newest data of a station. Names of notifications: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello"
+ * and "second"; for answers of the web server "ack", "renewed" and "aimed"; and "changed", with the names of what has changed
+ * in the database.
+ */
 export class Store {
   #listeners = new Map();
 
@@ -11,13 +15,13 @@ export class Store {
     this.role = role;
     this.holder = `web:${user}:${page}`;
     this.page = page;
-    this.snapshot = null; // the station's state as it last came
-    this.snapshotAt = -Infinity; // when, on this page's clock [ms]
-    this.facts = {}; // of the robot
-    this.joints = null; // {step, engaged, measured, commanded, simulated, ...} as they last came
-    this.link = { ok: false, reason: t("page.status.connecting", "connecting") }; // between web and runtime
-    this.open = false; // the socket to the web
-    this.closed = null; // why the web lets this page in no more, as labels.js has it
+    this.snapshot = null; // newest snapshot of the station
+    this.snapshotAt = -Infinity; // arrival time of the snapshot on this page's clock [ms]
+    this.facts = {}; // facts about the robot
+    this.joints = null; // newest {step, engaged, measured, commanded, simulated, ...}
+    this.link = { ok: false, reason: t("page.status.connecting", "connecting") }; // connection between web server and runtime
+    this.open = false; // true while the socket to the web server is open
+    this.closed = null; // entry of CLOSE_REASONS in labels.js if the web server refuses this page, else null
   }
 
   on(names, listener) {
@@ -32,7 +36,7 @@ export class Store {
       try {
         listener(content);
       } catch (error) {
-        reportError(error); // one pane that fails must not take the others with it
+        reportError(error); // a pane that fails must not stop the others
       }
     }
   }
@@ -48,7 +52,7 @@ export class Store {
     this.tell("joints", joints);
   }
 
-  /** Seconds since the state came; a state older than this page can bear is not the state. */
+  /** Age of the snapshot [s]; the page does not treat an old snapshot as the station's state. */
   get age() {
     return (performance.now() - this.snapshotAt) / 1000;
   }
@@ -57,7 +61,7 @@ export class Store {
     return this.open && this.link.ok && this.snapshot !== null && this.age < 1.5;
   }
 
-  /** "mine", "elsewhere" (another page of the same person), "other", "free", or "unknown". */
+  /** Who has the lease: "mine", "elsewhere" (another page of the same user), "other", "free" or "unknown". */
   get lease() {
     if (!this.snapshot) return "unknown";
     const { holder } = this.snapshot.lease;
@@ -66,7 +70,7 @@ export class Store {
     return holder.startsWith(`web:${this.user}:`) ? "elsewhere" : "other";
   }
 
-  /** Who has the lease, as people know them. */
+  /** Name of the holder of the lease: the user's name if it is a page. */
   get commander() {
     const [kind, name] = (this.snapshot?.lease.holder ?? "").split(":");
     if (kind !== "web") return this.snapshot?.lease.holder ?? "";

@@ -1,29 +1,29 @@
-// Where the robot would go: asked over the live socket, answered by the station, shown by whoever listens.
+// Where the robot would go: requested over the live socket, answered by the station, shown by listeners of "eva:aimed".
 
 import { t } from "../../site/sentences.js";
 
-const EVERY_MS = 80; // at least, between two questions; the newest one always goes out
-const PATIENCE_MS = 4000; // longer than the lab's own
+const EVERY_MS = 80; // shortest time between two requests [ms]; the newest request is always sent
+const PATIENCE_MS = 4000; // longer than the lab's own timeout [ms]
 
 /**
- * Asks the station where a target is; nothing moves. Every answer is told as the event "eva:aimed" on the document,
- * whose detail is {ok, reason, joints, poses, reached, clipped, distance, duration_s, ..., links}, or null where
- * there is no target any more: then no ghost of one may be shown.
+ * Asks the station where a target is; nothing moves. Every answer is sent as the event "eva:aimed" on the document, with the
+ * detail {ok, reason, joints, poses, reached, clipped, distance, duration_s, ..., links}; the detail is null if there is no
+ * target any more, and its ghost may then not be shown.
  */
 export class Aim {
   #send;
   #number = 0;
-  #shown = 0; // the newest question whose answer was shown, or that was cleared
+  #shown = 0; // number of the newest request whose answer was shown or discarded
   #waiting = new Map(); // id -> {resolve, timer}
-  #next = null; // the newest question that waits for its turn
+  #next = null; // newest request that waits to be sent
   #following = false;
 
-  /** `send(message)` is false where the socket is closed. */
+  /** `send(message)` returns false if the socket is closed. */
   constructor(send) {
     this.#send = send;
   }
 
-  /** Ask about `args` (joints, pose, jog); resolves to the answer, whose `ok` is false where there is none. */
+  /** Ask about `args` (joints, pose, jog); resolve to the answer, whose `ok` is false if none came. */
   ask(args) {
     const id = (this.#number += 1);
     return new Promise((resolve) => {
@@ -33,20 +33,23 @@ export class Aim {
     });
   }
 
-  /** Ask about what changes quickly, such as a slider: one at a time, and only the newest; `heard(answer)`. */
+  /**
+   * Ask about a target that changes quickly, such as a slider: one request at a time, and only the newest; `heard(answer)` is
+   * called with its answer.
+   */
   follow(args, heard) {
     this.#next = { args, heard };
     if (!this.#following) this.#go();
   }
 
-  /** There is no target any more. */
+  /** Discard the target. */
   clear() {
     this.#next = null;
-    this.#shown = this.#number; // what is still under way is no longer shown
+    this.#shown = this.#number; // answers still under way are not shown any more
     tell(null);
   }
 
-  /** An answer came over the socket. */
+  /** Take in an answer from the socket. */
   answered(answer) {
     const asked = this.#waiting.get(answer.id);
     if (!asked) return;
@@ -59,7 +62,7 @@ export class Aim {
     asked.resolve(answer);
   }
 
-  /** The next question waits for the answer: on a slow connection every answer would be out of date before it came. */
+  /** Send requests one at a time: otherwise, on a slow connection, every answer would be out of date when it came. */
   async #go() {
     this.#following = true;
     try {

@@ -1,4 +1,4 @@
-// The controls of the Debug page, put together.
+// Puts the controls of the Debug page together.
 
 import { Aim } from "./aim.js";
 import { config } from "../live/config.js";
@@ -19,17 +19,17 @@ export function byHand(store, socket, commands) {
   robotPanel(store, commands, aboutGripper);
   commands.provide("setup", bench);
   document.getElementById("hand").addEventListener("keydown", ({ key, target }) => {
-    if (key === "Enter" && target.matches("input")) target.blur(); // what was typed counts, and the keys are free again
+    if (key === "Enter" && target.matches("input")) target.blur(); // applies what was typed, and frees the keys again
   });
 }
 
-/** Unit and range of a group's gripper. */
+/** Return the gripper joint of a group, with its unit and range; undefined if there is none. */
 function aboutGripper(facts = {}, group) {
   const own = groupJoints({ units: config.units, ...facts }).find(({ name }) => name === group);
   return own?.joints.find(({ gripper }) => gripper);
 }
 
-/** How a simulated bench is to be laid out at set-up; nothing where it is to stay as it lies. */
+/** Return how a simulated bench is to be laid out at set-up; {} leaves it as it is. */
 function bench() {
   const seed = document.getElementById("seed");
   return seed && seed.value !== "" ? { bench: { seed: seed.valueAsNumber } } : {};

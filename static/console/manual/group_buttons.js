@@ -2,7 +2,7 @@
 
 import { t } from "../../site/sentences.js";
 
-/** One for each of `groups`; the key that chooses the next one stands on it. */
+/** Return a button for each of `groups`; the button of the next group shows the key that chooses it. */
 export function groupButtons(groups, chosen) {
   const next = (chosen + 1) % groups.length;
   return groups.map(({ name }, index) => groupButton(name, index, chosen, next));

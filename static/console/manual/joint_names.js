@@ -1,18 +1,19 @@
-// Names of joints, "group.joint": in groups, and as short as still tells one from the other.
+// Names of joints, "group.joint": arranged in groups, and shortened as far as they stay distinct.
 
 import { t } from "../../site/sentences.js";
 
-const LONG = 18; // letters that a list has room for
+const LONG = 18; // characters that fit in a list
 
-/** {group, joint} of a full name. */
+/** Split a full name into {group, joint}. */
 export function splitName(full) {
   const dot = full.indexOf(".");
   return dot < 0 ? { group: "joints", joint: full } : { group: full.slice(0, dot), joint: full.slice(dot + 1) };
 }
 
 /**
- * Short labels of the joints of one group: as few of a name's last words as tell all of them apart, without those
- * at the end that all share ("pan" of "shoulder_pan_joint" says too little where another is "1" of "wrist_1_joint").
+ * Return short labels for the joints of one group: as few of each name's last words as distinguish all of them, without last
+ * words that all share. A label begins with a letter, because "1" of "wrist_1_joint" says too little beside "pan" of
+ * "shoulder_pan_joint".
  */
 export function shortLabels(joints) {
   const words = joints.map((joint) => joint.split("_"));
@@ -25,13 +26,16 @@ export function shortLabels(joints) {
   return words.map((one) => one.join(" "));
 }
 
-/** Joints of one group [{joint, index}] with a short `label` each; a gripper is called so. */
+/** Return the joints of one group [{joint, index}] with a short `label` each; a gripper is labelled as such. */
 export function withLabels(joints, grippers) {
   const short = shortLabels(joints.filter(({ index }) => !grippers.includes(index)).map(({ joint }) => joint));
   return joints.map((one) => ({ ...one, label: grippers.includes(one.index) ? t("page.manual.gripper", "gripper") : short.shift() }));
 }
 
-/** Options of value 0, 1, ... for full names, `grippers` among them; several groups stand in the names and as headings. */
+/**
+ * Return options with the values 0, 1, ... for full names, some of which are `grippers`. With several groups, each has a
+ * heading, and long names are shortened to group and label.
+ */
 export function jointOptions(names, grippers = []) {
   const groups = new Map();
   names.forEach((full, index) => {

@@ -1,4 +1,4 @@
-// A slider and a number for each joint of a group, within its limits.
+// A slider and a number field for each joint of a group, within its limits.
 
 import { clampToLimits } from "./targets.js";
 import { digitsOf, shortUnit, stepOf } from "../curves/units.js";
@@ -10,7 +10,7 @@ export class JointRows {
   #rows = []; // {joint, slider, number, row}
   #typed;
 
-  /** `typed(index, value, said)` hears what a person set; `said` tells what was clipped. */
+  /** `typed(index, value, said)` is called when the user sets a value; `said` reports how it was limited, or is "". */
   constructor(typed) {
     this.#typed = typed;
   }
@@ -20,7 +20,7 @@ export class JointRows {
     this.#list.replaceChildren(...this.#rows.map(({ row }) => row));
   }
 
-  /** Where the target is; a field that is being typed in is left alone. */
+  /** Show the target; a field with the focus is left alone. */
   show(target) {
     for (const { joint, slider, number } of this.#rows) {
       const value = target[joint.index];
@@ -29,7 +29,7 @@ export class JointRows {
     }
   }
 
-  /** Where the robot is: a mark on each track. */
+  /** Mark on each track where the robot is. */
   now(measured) {
     for (const { joint, row } of this.#rows) {
       const at = (measured[joint.index] - joint.lower) / (joint.upper - joint.lower);
@@ -37,7 +37,7 @@ export class JointRows {
     }
   }
 
-  /** Go to the next slider, or with -1 to the one before, from the one that has the focus. */
+  /** Focus the next slider or, with `by` -1, the previous one, counted from the slider that has the focus. */
   focus(by) {
     const at = this.#rows.findIndex(({ slider }) => slider === document.activeElement);
     const count = this.#rows.length;
@@ -72,7 +72,7 @@ export class JointRows {
     this.#typed(joint.index, value, said);
   }
 
-  /** What is being typed counts at once, and is put in order when the field is left. */
+  /** Apply a number while it is typed; the field itself is limited and formatted when it is left. */
   #type(joint, given, slider) {
     if (!Number.isFinite(given)) return;
     const { value, said } = clampToLimits(joint, given);
@@ -80,7 +80,7 @@ export class JointRows {
     this.#typed(joint.index, value, said);
   }
 
-  /** Arrows go by one step, with Shift by ten: a slider's own steps would be too coarse, or not round. */
+  /** Move a slider by one step per arrow key, by ten with Shift: its built-in steps would be too coarse, or not round. */
   #arrow(event, joint, slider, number) {
     const sign = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
     if (!sign || event.ctrlKey || event.altKey || event.metaKey) return;

@@ -1,4 +1,4 @@
-// Moving by hand: a target made with sliders, numbers, named poses and steps of the hand, shown as a ghost, and sent.
+// Moving by hand: a target made with sliders, numbers, named poses and steps of the end effector, shown as a ghost, and sent.
 
 import { config } from "../live/config.js";
 import { groupButtons } from "./group_buttons.js";
@@ -10,17 +10,17 @@ export class ManualPanel {
   #store;
   #commands;
   #aim;
-  #names = ""; // of the joints that there are fields for
+  #names = ""; // names of the joints for which fields exist
   #groups = [];
   #group = 0;
   #target = null; // [D] where the robot would be sent
-  #pose = ""; // the named pose that the target is, as long as nobody changes it
-  #edited = false; // else the target follows the robot
-  #held = new Set(); // grippers that are part of the target; others stay as they are told by their own buttons
-  #sent = null; // of this press of Send, as long as the target is where the robot was sent
-  #clipped = ""; // what was said of the last edit
+  #pose = ""; // named pose that equals the target, until the target is changed
+  #edited = false; // while false, the target follows the robot
+  #held = new Set(); // grippers that are part of the target; the others stay as their own buttons have set them
+  #sent = null; // identifies the last press of Send while the target is where the robot was sent
+  #clipped = ""; // how the last edit was limited, in words
   #rows;
-  #steps = Promise.resolve(); // steps of the hand, one after the other
+  #steps = Promise.resolve(); // steps of the end effector, one after the other
   #poses = document.getElementById("pose");
   #speed = document.getElementById("speed");
 
@@ -36,12 +36,12 @@ export class ManualPanel {
     commands.provide("move", () => this.#move());
     store.on("snapshot", (snapshot) => this.#follow(snapshot));
     store.on("joints", () => this.#fromRobot());
-    store.on("second", () => this.#look()); // the robot comes nearer
+    store.on("second", () => this.#look()); // the distance shrinks while the robot moves
     document.addEventListener("eva:panel", () => this.#look());
     this.how("joints");
   }
 
-  /** Move by "joints" or by steps of the "hand". */
+  /** Show the controls for moving by "joints" or by steps of the "hand". */
   how(name) {
     for (const button of document.querySelectorAll("[data-how]")) button.setAttribute("aria-pressed", String(button.dataset.how === name));
     for (const panel of document.querySelectorAll("[data-how-panel]")) panel.hidden = panel.dataset.howPanel !== name;
@@ -62,12 +62,12 @@ export class ManualPanel {
     return this.#pose ? { pose: this.#pose, speed } : { joints: this.#moved, speed };
   }
 
-  /** The target, null where a gripper stays as it is: the station knows better where that is. */
+  /** The target, with null for each gripper that stays as it is: the station knows better where that is. */
   get #moved() {
     return this.#target.map((value, index) => (this.#grippers.includes(index) && !this.#held.has(index) ? null : value));
   }
 
-  /** The target is where the robot is, and goes with it. */
+  /** Put the target where the robot is and let it follow the robot. */
   reset(said = t("page.manual.at_robot", "The target is where the robot is.")) {
     this.#edited = false;
     this.#sent = null;
@@ -82,7 +82,7 @@ export class ManualPanel {
   #follow({ facts, state_is: is, mode, run }) {
     if (facts?.joint_names && facts.joint_names.join() !== this.#names) this.#build(facts);
     const elsewhere = is.preparing || is.latched || (run?.number && mode !== "manual");
-    if (elsewhere && this.#edited) this.reset(); // what was meant for another moment is not sent by accident
+    if (elsewhere && this.#edited) this.reset(); // a target meant for an earlier situation must not be sent by accident
     const send = document.querySelector('[data-command="move"]');
     send.dataset.blocked = this.#edited ? "" : t("page.manual.no_target", "the target is where the robot is: move a slider, take a step, or choose a pose");
   }
@@ -163,7 +163,7 @@ export class ManualPanel {
     this.#commands.gate();
   }
 
-  /** Ask where the target is, and show it, as long as this panel is shown. */
+  /** Ask the station about the target and show the answer, if this panel is shown. */
   #look() {
     if (!this.#edited) return;
     if (document.getElementById("panel-manual").hidden) this.#aim.clear();
@@ -173,7 +173,10 @@ export class ManualPanel {
     }
   }
 
-  /** `sent` is the press that had been made when this was asked: an answer from before it says of no arrival. */
+  /**
+   * Show an answer. `sent` is the press of Send before this request; an answer requested before the press does not prove
+   * arrival.
+   */
   #heard(answer, sent = null) {
     if (sent && sent === this.#sent && answer.ok && isAtTarget(answer)) {
       this.reset(t("page.manual.arrived", "The robot has arrived."));
@@ -202,7 +205,7 @@ export class ManualPanel {
     this.#steps = this.#steps.then(() => this.#stepped(step));
   }
 
-  /** A step that cannot be reached leaves the target where it was, and its ghost too. */
+  /** Take a step; if it cannot be reached, target and ghost stay where they were. */
   async #stepped(step) {
     const answer = await this.#aim.ask({ joints: this.#target, jog: step });
     const reached = answer.ok && answer.reached !== false;

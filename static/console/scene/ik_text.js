@@ -1,14 +1,17 @@
-// How well the poses of a chunk were met, in words.
+// How well the poses of a chunk were reached, in words.
 
 import { t } from "../../site/sentences.js";
 
-/** A number that is not shown as 0 where it is not. */
+/** Format a number; one that would round to 0 is shown as "below" the smallest shown value. */
 function small(value, digits) {
   const least = 10 ** -digits;
   return value > 0 && value < least ? t("page.reach.below", "below {least}", { least: least.toFixed(digits) }) : value.toFixed(digits);
 }
 
-/** `ik` as the station tells it: rows, over, limit, velocity, singular, worst_mm, worst_deg; "" where it is about joints. */
+/**
+ * Describe `ik` of the station (rows, over, limit, velocity, singular, worst_mm, worst_deg) in words; "" if the chunk has no
+ * poses.
+ */
 export function ikText({ rows = 0, over = 0, limit = 0, velocity = 0, singular = 0, worst_mm: mm, worst_deg: deg } = {}) {
   if (!rows) return "";
   const known = Number.isFinite(mm) && Number.isFinite(deg);

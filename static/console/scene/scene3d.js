@@ -1,4 +1,4 @@
-// The robot in 3D by the viewer script of meshcat: shapes once, then one matrix per part and frame.
+// The robot in 3D with meshcat's viewer script: the shapes are sent once, then one matrix per part and frame.
 
 import { block, ground, mount, plate, table } from "./scene_bench.js";
 import { Capsules } from "./scene_capsules.js";
@@ -14,10 +14,10 @@ import { Tips } from "./scene_tips.js";
 import { Views } from "./scene_views.js";
 import { t } from "../../site/sentences.js";
 
-const STILL = 2e-5; // m, and about as much of a turn: less than a pixel
+const STILL = 2e-5; // m, and about as much for a rotation: less than a pixel
 const OURS = ["bench", "robot", "ghost", "capsules", "frame", "path", "chunk"];
 
-/** `element` is filled by it; throws where the browser has no WebGL. */
+/** The 3D scene in `element`; throws if the browser has no WebGL. */
 export class Scene3D {
   #viewer;
   #views;
@@ -35,7 +35,7 @@ export class Scene3D {
   #geometry = null;
   #shown = { ghost: false, frames: false, path: true, chunk: true, capsules: false };
   #simulated = false;
-  #drawn = new Float32Array(0); // the numbers of all parts as they were drawn last
+  #drawn = new Float32Array(0); // the numbers of all parts as they were last drawn
   #framed = false;
 
   constructor(element) {
@@ -53,7 +53,7 @@ export class Scene3D {
     document.addEventListener("eva:theme", () => this.#ground());
   }
 
-  /** Draw the robot and the bench of `geometry`; what was drawn before is gone. */
+  /** Draw the robot and the bench of `geometry`, and remove what was drawn before. */
   show(geometry) {
     for (const path of OURS) this.#viewer.delete_path([path]);
     this.#geometry = geometry;
@@ -67,12 +67,12 @@ export class Scene3D {
     if (geometry.home) this.setPoses(Float32Array.from(geometry.home.flat()), 1);
   }
 
-  /** Where every part is: [count * P * 16]; the second is where it was told to be, the third a simulated robot. */
+  /** Set the matrices of every part, [count * P * 16]: the measured robot, then the commanded one, then a simulated one. */
   setPoses(numbers, count) {
     const size = this.#parts.length * SIZE;
-    if (numbers.length !== count * size) return; // of the robot in other groups: its shapes are on their way
+    if (numbers.length !== count * size) return; // of the robot in other groups, whose shapes are being fetched
     const film = this.#preview.at(performance.now());
-    if (!film && this.#framed && !this.#moved(numbers)) return; // drawn already, as it is
+    if (!film && this.#framed && !this.#moved(numbers)) return; // already drawn like this
     place(this.#parts, numbers, 0);
     this.#ghosts.pose("commanded", count > 1 ? numbers : null, size);
     this.#ghosts.pose("simulated", count > 2 ? numbers : null, 2 * size);
@@ -82,12 +82,12 @@ export class Scene3D {
     this.#viewer.set_dirty();
   }
 
-  /** Where the things on a simulated bench are: {blocks: [[x, y, z, yaw]], plate: [x, y]}. */
+  /** Place the objects on a simulated bench: {blocks: [[x, y, z, yaw]], plate: [x, y]}. */
   setBench({ blocks = [], plate: at }) {
     const bench = this.#geometry?.bench;
     if (!bench || !Array.isArray(at)) return;
     const lies = JSON.stringify([blocks, at]);
-    if (this.#plate && lies === this.#lies) return; // drawn already, as it is
+    if (this.#plate && lies === this.#lies) return; // already drawn like this
     this.#lies = lies;
     this.#plate ??= this.#add("bench/plate", plate(bench));
     this.#plate.position.set(at[0], at[1], 0);
@@ -103,13 +103,16 @@ export class Scene3D {
     this.#viewer.set_dirty();
   }
 
-  /** A chunk's rows {state, targets, overlap, tips}, as dots; null: none. */
+  /** Draw a chunk's rows {state, targets, overlap, tips} as dots; null draws none. */
   setChunk(chunk) {
     this.#dots.show(this.#shown.chunk ? chunk : null);
     this.#viewer.set_dirty();
   }
 
-  /** A proposed chunk as a robot that goes through it: matrices [N * P * 16] at `rows`, `period` s apart; null: none. */
+  /**
+   * Animate a proposed chunk as a ghost that moves through it: matrices [N * P * 16] at the rows `rows`, where rows are
+   * `period` s apart; null ends it.
+   */
   propose(rows, numbers, period) {
     if (numbers) this.#preview.begin(rows, numbers, period);
     else this.#preview.end();
@@ -117,24 +120,24 @@ export class Scene3D {
     this.#viewer.set_dirty();
   }
 
-  /** Where the robot would go, [P * 16]; null: nowhere. */
+  /** Draw the ghost of a target, matrices [P * 16]; null removes it. */
   aim(numbers) {
     this.#ghosts.pose("aim", numbers);
     this.#viewer.set_dirty();
   }
 
-  /** Whether that ghost is drawn now: "commanded", "aim", "chunk" or "simulated". */
+  /** Return whether that ghost is drawn now: "commanded", "aim", "chunk" or "simulated". */
   draws(ghost) {
     return this.#ghosts.visible(ghost);
   }
 
-  /** "all", "front", "top", or "wrist", which goes on to the next arm each time. */
+  /** Show the view "all", "front" or "top", or "wrist", which moves on to the next arm at each call. */
   view(name) {
     this.#views.show(name, this.#tips.count);
     this.#follow();
   }
 
-  /** Show or hide "ghost" (the commanded pose), "frames", "path", "chunk" or "capsules"; returns whether it is shown now. */
+  /** Show or hide "ghost" (the commanded pose), "frames", "path", "chunk" or "capsules"; return whether it is now shown. */
   toggle(what) {
     this.#shown[what] = !this.#shown[what];
     this.#apply();
@@ -159,7 +162,7 @@ export class Scene3D {
     return object;
   }
 
-  /** The viewer measures the window; ours is a pane, and what had to be in view stays so. */
+  /** Size the viewer by `element` instead of the window, and keep in view what was in view. */
   #fitTo(element) {
     const fit = this.#viewer.set_3d_pane_size.bind(this.#viewer);
     this.#viewer.set_3d_pane_size = () => {
@@ -199,18 +202,18 @@ export class Scene3D {
     this.#apply();
   }
 
-  /** Whether anything is elsewhere than it was drawn last. */
+  /** Return whether any part has moved since it was last drawn. */
   #moved(numbers) {
     const before = this.#drawn;
     let same = numbers.length === before.length;
     for (let at = 0; same && at < numbers.length; at += 1) {
-      same = Math.abs(numbers[at] - before[at]) <= STILL || Object.is(numbers[at], before[at]); // there may be NaN
+      same = Math.abs(numbers[at] - before[at]) <= STILL || Object.is(numbers[at], before[at]); // NaN equals NaN here
     }
     if (!same) this.#drawn = numbers.slice();
     return !same;
   }
 
-  /** The robot that acts: in a simulation the simulated one. */
+  /** Let paths, frames, capsules and camera follow the robot that acts: in a simulation the simulated one. */
   #follow() {
     const simulated = this.#ghosts.visible("simulated");
     if (simulated !== this.#simulated) this.#tips.forget();
@@ -220,7 +223,7 @@ export class Scene3D {
     if (this.#views.following >= 0) this.#views.follow(this.#tips.world(this.#views.following));
   }
 
-  /** Look at the whole robot, where it is and where its named poses would take it, and at the bench. */
+  /** Show the whole robot, in its present pose and in its named poses, and the bench. */
   #frame() {
     const { Box3, Matrix4, Vector3 } = three();
     const { view, ahead, floor } = this.#geometry;

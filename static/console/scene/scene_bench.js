@@ -1,10 +1,10 @@
-// What stands around the robot: table, mounts and ground, and on a simulated bench plate and blocks. Metres, z up.
+// The surroundings of the robot: table, mounts and ground, and on a simulated bench plate and blocks. Metres, z up.
 
 import { css, material, shape, three } from "./scene_shapes.js";
 
-const LEG = 0.045; // m, edge
-const UNDER = 0.04; // m below the table's surface, of a ground that is no floor
-const SIDE = 5; // m, of the ground
+const LEG = 0.045; // edge of a leg [m]
+const UNDER = 0.04; // depth of the ground below the table's surface if there is no floor [m]
+const SIDE = 5; // side of the ground [m]
 
 function box(size, colour, at) {
   const THREE = three();
@@ -13,7 +13,7 @@ function box(size, colour, at) {
   return mesh;
 }
 
-/** Its surface is z = 0; with `legs`, how far it stands above the floor. */
+/** Return a table with its surface at z = 0; `legs` is the height of the surface above the floor, if the table has legs. */
 export function table({ centre: [x, y], size: [width, depth], thickness, colour, legs }) {
   const group = new (three().Group)();
   group.add(box([width, depth, thickness], colour, [x, y, -thickness / 2 - 0.001]));
@@ -29,7 +29,7 @@ export function table({ centre: [x, y], size: [width, depth], thickness, colour,
   return group;
 }
 
-/** A column with a foot, up to where a base stands on it. */
+/** Return a column with a foot, up to the base that stands on it. */
 export function mount({ at: [x, y], from, to, radius, colour }) {
   const THREE = three();
   const group = new THREE.Group();
@@ -43,7 +43,7 @@ export function mount({ at: [x, y], from, to, radius, colour }) {
   return group;
 }
 
-/** A grid, on the floor where there is one. */
+/** Return a grid, at the height of the floor if there is one. */
 export function ground(floor) {
   const grid = new (three().GridHelper)(SIDE, SIDE * 10, css("--scene-grid"), css("--scene-grid"));
   grid.rotateX(Math.PI / 2);
@@ -51,7 +51,7 @@ export function ground(floor) {
   return grid;
 }
 
-/** A flat plate around its own middle, standing on z = 0. */
+/** Return a flat plate centred on its own origin, standing on z = 0. */
 export function plate({ plate_radius: radius, plate_height: height, plate_colour: colour, plate_rim_colour: rim }) {
   const THREE = three();
   const group = new THREE.Group();
@@ -63,7 +63,7 @@ export function plate({ plate_radius: radius, plate_height: height, plate_colour
   return group;
 }
 
-/** The block number `index`, around its own middle. */
+/** Return block number `index`, centred on its own origin. */
 export function block({ block_edge: edge, block_colours: colours }, index) {
   return new (three().Mesh)(shape("box", [edge, edge, edge]), material(colours[index % colours.length]));
 }

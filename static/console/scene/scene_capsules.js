@@ -1,11 +1,11 @@
-// The capsules that stand for the robot's links where it is looked at whether it would run into something.
+// The capsules that represent the robot's links when collisions are checked.
 
 import { shape, three } from "./scene_shapes.js";
 
 const LOOK = { color: "#f5b642", transparent: true, opacity: 0.26, depthWrite: false };
 
 export class Capsules {
-  #capsules; // [{part, start, end, radius}] of the server
+  #capsules; // [{part, start, end, radius}] from the server
   #objects;
 
   /** `add(path, object)` puts an object into the scene. */
@@ -20,7 +20,7 @@ export class Capsules {
     for (const object of this.#objects) object.visible = shown;
   }
 
-  /** The robot is at `parts` now (its groups). */
+  /** Move the capsules with the robot's `parts` (its groups). */
   move(parts) {
     this.#capsules.forEach(({ part }, index) => {
       this.#objects[index].matrix.copy(parts[part].matrix);
@@ -29,7 +29,7 @@ export class Capsules {
   }
 }
 
-/** A cylinder between two spheres. */
+/** Return a capsule: a cylinder between two spheres. */
 function drawn({ start, end, radius }, look) {
   const THREE = three();
   const group = new THREE.Group();

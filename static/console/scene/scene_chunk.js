@@ -1,4 +1,4 @@
-// Where a chunk of actions takes the fingertips: a dot per row and arm, a ring at its seam, the first row executed.
+// Where a chunk of actions takes the fingertips: a dot per row and arm, and a ring at its seam, the first row that is executed.
 
 import { ARM_COLOURS } from "./scene_tips.js";
 import { three } from "./scene_shapes.js";
@@ -6,11 +6,11 @@ import { three } from "./scene_shapes.js";
 const DOT = 7; // px
 const RING = 17;
 const IDLE = "#8793a0"; // of rows that are not executed
-const PALE = 0.55; // how far rows that are blended with the plan before are towards white
+const PALE = 0.55; // how far the colour of rows that are blended with the previous plan is mixed with white
 
 /**
- * What becomes of the rows of a chunk: {seam, looks}; `seam` is the first row that is executed (-1: none), `looks`
- * says "idle", "blended" or "own" of each. All rows of a proposed one are its own, and it begins with its first.
+ * Return what happens to the rows of a chunk: {seam, looks}. `seam` is the first row that is executed (-1 for none); `looks`
+ * says "idle", "blended" or "own" for each row. All rows of a proposed chunk are its own, and its seam is its first row.
  */
 export function rowsOf({ state, targets, overlap = 0 }) {
   if (state === "proposed") return { seam: 0, looks: targets.map(() => "own") };
@@ -25,7 +25,7 @@ export class ChunkDots {
   #rings = points(RING, ring);
   objects = [this.#dots, this.#rings];
 
-  /** Draw `tips` [H * arms * 3] of a chunk; nothing where there is none. */
+  /** Draw the `tips` [H * arms * 3] of a chunk; null draws nothing. */
   show(chunk) {
     const { targets, tips } = chunk ?? {};
     const count = tips?.length ? targets.length : 0;
@@ -74,12 +74,12 @@ function points(size, draw) {
   const look = { size, vertexColors: true, sizeAttenuation: false, map: picture(draw), transparent: true, alphaTest: 0.4, depthTest: false };
   const made = new THREE.Points(new THREE.BufferGeometry(), new THREE.PointsMaterial(look));
   made.frustumCulled = false;
-  made.renderOrder = 1; // over the robot: what it will do is never hidden by what it is
+  made.renderOrder = 1; // drawn over the robot, which must not hide what it will do
   made.visible = false;
   return made;
 }
 
-/** Room for `count` points, and as many drawn; the buffers only ever grow. */
+/** Make room for `count` points and draw that many; the buffers only ever grow. */
 function fit(object, count) {
   const THREE = three();
   const { geometry } = object;

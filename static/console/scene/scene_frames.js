@@ -1,4 +1,4 @@
-// Frames as small triads, x red, y green, z blue: of the end effectors, and those in which their poses are given.
+// Frames as small triads (x red, y green, z blue): those of the end effectors, and those in which their poses are given.
 
 import { shape, three } from "./scene_shapes.js";
 
@@ -8,18 +8,20 @@ const AXES = [
   { colour: "#5b9bff", turn: [0, 0, 0] },
 ];
 const LENGTH = { end: 0.075, reference: 0.13 }; // m
-const THICK = 0.0026; // m, radius
-const LABEL = 0.023; // height of a name, where 1 is about the view's
-const BELOW = [0.5, 1.6]; // where the frame is in its name's box, from 0 to 1
+const THICK = 0.0026; // radius [m]
+const LABEL = 0.023; // height of a name, as a share of about the view's height
+const BELOW = [0.5, 1.6]; // position of the frame relative to its name's box, which is 1 wide and 1 high
 const ABOVE = [1.05, -0.5];
 
 export class Frames {
-  #frames; // [{part, pose}] of the server
+  #frames; // [{part, pose}] from the server
   #offsets;
   #triads;
   #moving;
 
-  /** `frames` [{name, kind, part, pose}], part null for one that stands still; `add` puts an object into the scene. */
+  /**
+   * `frames` is [{name, kind, part, pose}]; part is null for a frame that does not move. `add` puts an object into the scene.
+   */
   constructor(frames, add) {
     const THREE = three();
     this.#frames = frames;
@@ -36,7 +38,7 @@ export class Frames {
     for (const triad of this.#triads) triad.visible = shown;
   }
 
-  /** The robot is at `parts` now (its groups). */
+  /** Move the frames with the robot's `parts` (its groups). */
   move(parts) {
     this.#frames.forEach(({ part }, index) => {
       if (part === null) return;
@@ -47,7 +49,7 @@ export class Frames {
   }
 }
 
-/** Drawn over the robot: an end effector's frame lies inside of it. */
+/** Return a triad, drawn over the robot, because an end effector's frame lies inside it. */
 function triad({ name, kind, part }) {
   const THREE = three();
   const group = new THREE.Group();

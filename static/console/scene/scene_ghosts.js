@@ -1,9 +1,9 @@
-// Robots that are not the real one: the commanded pose, a target, a proposed chunk, the robot of a simulation.
+// The robots besides the real one: the commanded pose, a target, a proposed chunk, the robot of a simulation.
 
 import { place, robotParts, SIZE } from "./scene_robot.js";
 import { ghostPaint } from "./scene_shapes.js";
 
-/** Each a translucent blue; what is to be looked at is more solid than what is only compared with. */
+/** All are a translucent blue; the more important ghosts are less transparent than one for comparison. */
 export const GHOSTS = {
   commanded: { colour: "#3b8cff", opacity: 0.28 },
   aim: { colour: "#3b8cff", opacity: 0.42 },
@@ -15,18 +15,18 @@ export class Ghosts {
   #geometry;
   #add;
   #drawing;
-  #robots = new Map(); // made when they are first wanted: most pages never show most of them
+  #robots = new Map(); // made at first use, because most pages never show most of them
   #there = new Set();
   #hidden = new Set();
 
-  /** `add(path, object)` puts an object into the scene; `drawing` is how robots are drawn there. */
+  /** `add(path, object)` puts an object into the scene; `drawing` says how robots are drawn in it. */
   constructor(geometry, add, drawing) {
     this.#drawing = drawing;
     this.#geometry = geometry;
     this.#add = add;
   }
 
-  /** Where the parts of ghost `name` are, [P * 16] from `from` on; null, or not a number: nowhere. */
+  /** Place the parts of ghost `name`, [P * 16] from index `from` on; remove it if `numbers` is null or begins with NaN. */
   pose(name, numbers, from = 0) {
     if (!numbers || numbers.length < from + this.#geometry.parts.length * SIZE || Number.isNaN(numbers[from])) this.#there.delete(name);
     else {
@@ -36,19 +36,19 @@ export class Ghosts {
     this.#show(name);
   }
 
-  /** Whether ghost `name` is drawn where it is somewhere. */
+  /** Set whether ghost `name` is drawn when it has a pose. */
   allow(name, shown) {
     if (shown) this.#hidden.delete(name);
     else this.#hidden.add(name);
     this.#show(name);
   }
 
-  /** Whether it is drawn now. */
+  /** Return whether that ghost is drawn now. */
   visible(name) {
     return this.#there.has(name) && !this.#hidden.has(name);
   }
 
-  /** The groups of a ghost that is drawn. */
+  /** Return the groups of a ghost. */
   parts(name) {
     return this.#robot(name);
   }

@@ -1,24 +1,24 @@
-// Meshes of the server, read by the loaders that are inside the viewer's script: STL, OBJ and DAE.
+// Meshes from the server, parsed by the loaders inside the viewer's script: STL, OBJ and DAE.
 
 import { three } from "./scene_shapes.js";
 
-const WHITE = "data:image/gif;base64,R0lGODlhAQABAIAAAP///wAAACwAAAAAAQABAAACAkQBADs="; // in place of textures
+const WHITE = "data:image/gif;base64,R0lGODlhAQABAIAAAP///wAAACwAAAAAAQABAAACAkQBADs="; // replaces textures
 const NO_TEXTURES = new Proxy({}, { get: () => WHITE });
 
-/** Reads each address once, whoever asks for it. */
+/** Loads each address once, however often it is requested. */
 export class Meshes {
   #viewer;
-  #read = new Map(); // by address: promises
+  #read = new Map(); // address -> promise
 
   constructor(viewer) {
     this.#viewer = viewer;
   }
 
-  /** Resolves to {geometry, material}; the material is the file's own, null where it has none. */
+  /** Resolve to {geometry, material}; the material is that of the file, or null if it has none. */
   get({ address, format }) {
     if (!this.#read.has(address)) {
       const coming = fetched(address).then((bytes) => this.#parsed(address, format, bytes));
-      coming.catch(() => this.#read.delete(address)); // the next one may try again
+      coming.catch(() => this.#read.delete(address)); // so that the next request tries again
       this.#read.set(address, coming);
     }
     return this.#read.get(address);
@@ -30,9 +30,9 @@ export class Meshes {
     const { geometry, material } = this.#viewer.scene_tree.find([...path, "<object>"]).object;
     this.#viewer.delete_path(path);
     if (!geometry?.attributes.position?.count) throw new Error(`a ${format} file without triangles`);
-    if (format === "stl") geometry.computeVertexNormals(); // many files leave them zero
+    if (format === "stl") geometry.computeVertexNormals(); // many files leave the normals zero
     const metres = format === "dae" ? unit(bytes) : 1;
-    geometry.scale(metres, metres, metres); // which the loader leaves to who draws it
+    geometry.scale(metres, metres, metres); // the loader leaves this scaling to its user
     return { geometry, material: format === "dae" ? material : null };
   }
 }
@@ -45,13 +45,13 @@ async function fetched(address) {
 
 const text = (bytes) => new TextDecoder().decode(bytes);
 
-/** The length of a COLLADA file's unit [m]. */
+/** Return the length of a COLLADA file's unit [m]. */
 function unit(bytes) {
   const found = /<unit\b[^>]*\bmeter\s*=\s*["']([^"']+)["']/.exec(text(bytes));
   return found ? Number(found[1]) : 1;
 }
 
-/** The file as the viewer's command "set_object" carries it. */
+/** Return the file in the form of the viewer's command "set_object". */
 function description(format, bytes) {
   const whole = { metadata: { version: 4.5, type: "Object" } };
   if (format === "dae") {
@@ -62,7 +62,10 @@ function description(format, bytes) {
   return { ...whole, geometries: [geometry], materials: [look], object: { uuid: "mesh", type: "Mesh", geometry: "shape", material: "look" } };
 }
 
-/** The mesh of `visual` in place of `box`, which stands for it until then; `changed(mesh)` hears when it is there. */
+/**
+ * Replace `box`, the placeholder, by the mesh of `visual`; `changed(mesh)` is called when it has been loaded. If it cannot be
+ * loaded, the box stays.
+ */
 export async function exchange(meshes, visual, box, paint, changed) {
   try {
     const { geometry, material } = await meshes.get(visual);

@@ -1,4 +1,4 @@
-// The pane of the 3D scene: its buttons, what is drawn beside the robot, and a sentence where it cannot be drawn.
+// The pane of the 3D scene: its buttons, the ghosts beside the robot, and a sentence if the scene cannot be drawn.
 
 import { get, RequestFailed } from "../../site/api.js";
 import { aimGhost } from "./aim_ghost.js";
@@ -9,9 +9,12 @@ import { DisplayedChunk } from "./displayed_chunk.js";
 import { Tags } from "./tags.js";
 import { t } from "../../site/sentences.js";
 
-const AGAIN_MS = 3000; // until shapes are asked for again
+const AGAIN_MS = 3000; // wait before shapes are requested again
 
-/** Resolves to {poses(numbers, count), bench(truth), chunk(chunk), software}; they do nothing where there is no scene. */
+/**
+ * Make the pane; resolve to {poses(numbers, count), bench(truth), chunk(chunk), software}, which do nothing if there is no
+ * scene.
+ */
 export async function scenePane(store) {
   const note = document.getElementById("scene-note");
   try {
@@ -45,18 +48,18 @@ export async function scenePane(store) {
   }
 }
 
-/** The robot's shapes, in the groups that the station says it has: fetched again when it says something else. */
+/** The robot's shapes, in the groups that the station reports; fetched again when it reports others. */
 class Shapes {
   #store;
   #show;
-  #groups = null; // of the shapes that were asked for last
+  #groups = null; // groups of the last request
 
   constructor(store, show) {
     this.#store = store;
     this.#show = show;
   }
 
-  /** Resolves when something is drawn, and says why not yet; from then on the station is followed. */
+  /** Resolve when the shapes are drawn; `say(why)` reports why they are not yet. From then on, follow the station. */
   async fetch(say) {
     await this.#get(this.#said, say);
     this.#store.on("snapshot", () => this.#follow());
@@ -70,7 +73,7 @@ class Shapes {
   async #get(groups, say) {
     this.#groups = groups;
     const geometry = await patiently(() => get(groups ? `${config.geometry}?groups=${groups}` : config.geometry), say);
-    if (this.#groups !== groups) return; // it has said something else meanwhile
+    if (this.#groups !== groups) return; // the station has reported other groups meanwhile
     this.#groups = geometry.groups.join();
     this.#show(geometry);
   }
@@ -82,7 +85,7 @@ class Shapes {
   }
 }
 
-/** What `ask` resolves to; asked again while the web is busy or cannot be reached, which is said. */
+/** Resolve to the result of `ask`; retry while the web server is busy or cannot be reached, and report that through `say`. */
 async function patiently(ask, say) {
   for (;;) {
     try {
@@ -96,7 +99,7 @@ async function patiently(ask, say) {
   }
 }
 
-/** Say in the corner which robots are drawn beside the real one. */
+/** Name in the corner which robots are drawn besides the real one. */
 function nameGhosts(tags, scene, shown) {
   const words = {
     simulated: t("page.scene3d.simulated", "simulated robot; the solid one is the real robot, which receives none of this"),

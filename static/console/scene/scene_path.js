@@ -1,9 +1,9 @@
-// The way a fingertip went: the last points as a line that fades with age.
+// The path of a fingertip: its last points as a line that fades with age.
 
 import { three } from "./scene_shapes.js";
 
 const POINTS = 240;
-const STEP_M = 0.003; // nearer than this is no new point
+const STEP_M = 0.003; // smaller steps add no point
 const JUMP_M = 0.15;
 
 export class Path {
@@ -27,7 +27,7 @@ export class Path {
     const last = this.#points.at(-1);
     const step = last ? Math.hypot(x - last[0], y - last[1], z - last[2]) : Infinity;
     if (step < STEP_M) return;
-    if (step > JUMP_M) this.#points = []; // not a way it went: nothing was seen in between
+    if (step > JUMP_M) this.#points = []; // no motion, but a time without data
     this.#points.push([x, y, z]);
     if (this.#points.length > POINTS) this.#points.shift();
     this.#write();

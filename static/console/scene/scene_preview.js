@@ -1,10 +1,10 @@
-// A proposed chunk as a film: the ghost goes through its rows as fast as the robot would, again and again.
+// A proposed chunk as an animation: the ghost goes through its rows at the robot's speed, again and again.
 
-const REST_S = 0.7; // at its end, before it begins again
+const REST_S = 0.7; // pause at the end, before it begins again
 
 /**
- * Where the film is `seconds` after it began, with keyframes at `rows` (row numbers) of a chunk whose rows are
- * `period` seconds apart: {from, to, share} between two keyframes.
+ * Return the position `seconds` after the start, with keyframes at `rows` (row numbers) of a chunk whose rows are `period`
+ * seconds apart: {from, to, share} between two keyframes.
  */
 export function moment(rows, period, seconds) {
   const last = rows.length - 1;
@@ -20,11 +20,11 @@ export function moment(rows, period, seconds) {
 export class Preview {
   #rows = [];
   #numbers = null; // [N * P * 16]
-  #pose = null; // [P * 16], of this moment
+  #pose = null; // [P * 16] at the present moment
   #began = 0; // on this page's clock [ms]
   #period;
 
-  /** Show `numbers`, matrices of all parts at each of `rows`, from the first on. */
+  /** Start the animation of `numbers`, matrices of all parts at each of `rows`. */
   begin(rows, numbers, period) {
     this.#rows = rows;
     this.#numbers = numbers;
@@ -37,7 +37,7 @@ export class Preview {
     this.#numbers = null;
   }
 
-  /** The parts at `now` [ms], null where nothing is shown; overwritten by the next call. */
+  /** Return the matrices of the parts at `now` [ms], or null if nothing is shown; the next call overwrites them. */
   at(now) {
     if (!this.#numbers) return null;
     const { from, to, share } = moment(this.#rows, this.#period, (now - this.#began) / 1000);

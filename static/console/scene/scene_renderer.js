@@ -1,8 +1,11 @@
-// What draws the 3D scene: WebGL by a graphics card, or by the processor where there is none.
+// The renderer of the 3D scene: WebGL with a graphics card or, without one, on the processor.
 
 import { three } from "./scene_shapes.js";
 
-/** Edges are smoothed where a graphics card does it; in software that would cost more than all the rest. */
+/**
+ * Make the renderer in `element` and return {renderer, software}. Edges are smoothed only by a graphics card; in software that
+ * would cost more than everything else.
+ */
 export function rendererIn(element) {
   const THREE = three();
   let renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
@@ -23,9 +26,9 @@ function bySoftware(renderer) {
   return names !== null && /swiftshader|llvmpipe|software/i.test(gl.getParameter(names.UNMASKED_RENDERER_WEBGL));
 }
 
-const cheaper = new WeakMap(); // by the material it stands for
+const cheaper = new WeakMap(); // material -> its cheaper replacement
 
-/** Light the object corner by corner instead of pixel by pixel: what a processor can draw fifteen times a second. */
+/** Light the object per vertex instead of per pixel, which a processor can draw fifteen times a second. */
 export function lightenWork(object) {
   object.traverse((mesh) => {
     if (!mesh.material?.isMeshPhongMaterial) return;

@@ -1,11 +1,11 @@
-// The parts of a robot as groups of shapes, put where the server says.
+// The parts of a robot as groups of shapes, placed by the server's matrices.
 
 import { exchange } from "./scene_meshes.js";
 import { material, shape, three } from "./scene_shapes.js";
 
 export const SIZE = 16; // numbers of a matrix
 
-/** Put `groups` at matrices that begin at `from` in `numbers`. */
+/** Give `groups` the matrices in `numbers` that begin at index `from`. */
 export function place(groups, numbers, from) {
   groups.forEach((group, index) => {
     group.matrix.fromArray(numbers, from + index * SIZE);
@@ -14,8 +14,8 @@ export function place(groups, numbers, from) {
 }
 
 /**
- * One group per part, its matrix free to be set; `paint` overrides the colours. Meshes come when they are read, by
- * `meshes`, and are boxes until then; `changed(object)` hears of each.
+ * Return one group per part, whose matrix is set by `place`. `paint` overrides the colours. Meshes are boxes until `meshes` has
+ * loaded them; `changed(object)` is called for each.
  */
 export function robotParts({ parts, visuals }, { meshes, changed, paint = null }) {
   const THREE = three();

@@ -1,4 +1,4 @@
-// What hangs on fingertips: the ways they went, and the camera that follows one.
+// The fingertips: their paths, and the position that the camera follows.
 
 import { Path } from "./scene_path.js";
 import { css, three } from "./scene_shapes.js";
@@ -6,7 +6,7 @@ import { css, three } from "./scene_shapes.js";
 export const ARM_COLOURS = ["#4fa3ff", "#f7a04b", "#46d17f", "#c79bff"];
 
 export class Tips {
-  #tips; // [{part, pose}] of the server
+  #tips; // [{part, pose}] from the server
   #offsets;
   #places;
   #paths = [];
@@ -31,7 +31,7 @@ export class Tips {
     for (const path of this.#paths) path.object.visible = paths;
   }
 
-  /** The robot is at `parts` now (its groups). */
+  /** Move the fingertips with the robot's `parts` (its groups). */
   move(parts) {
     this.#tips.forEach((tip, index) => {
       const world = this.#places[index].multiplyMatrices(parts[tip.part].matrix, this.#offsets[index]).elements;
@@ -39,12 +39,12 @@ export class Tips {
     });
   }
 
-  /** Where fingertip `index` is: 16 numbers, column by column. */
+  /** Return the matrix of fingertip `index`: 16 numbers, column by column. */
   world(index) {
     return this.#places[index].elements;
   }
 
-  /** Another robot goes on: its way begins here. */
+  /** Start the paths anew, because another robot acts from now on. */
   forget() {
     for (const path of this.#paths) path.clear();
   }

@@ -1,12 +1,12 @@
-// Where the 3D scene is looked at from. The viewer's camera lives in three.js' own frame, y up.
+// The viewpoints of the 3D scene. The viewer's camera uses the frame of three.js, y up.
 
 import { three } from "./scene_shapes.js";
 
-const FIELD = 38; // degrees, from top to bottom
-const ROOM = 1.09; // around what has to be in view
-const TOOLS = 46; // px at the top of the pane that its buttons take
-const ROUNDS = 6; // until the middle of what is seen is in the middle
-const WRIST = { behind: 0.28, aside: 0.4, ahead: 0 }; // m from a fingertip
+const FIELD = 38; // vertical angle of view [deg]
+const ROOM = 1.09; // margin factor around what must be in view
+const TOOLS = 46; // height at the top of the pane that its buttons cover [px]
+const ROUNDS = 6; // iterations that centre what is seen
+const WRIST = { behind: 0.28, aside: 0.4, ahead: 0 }; // distances from a fingertip [m]
 
 function inThree([x, y, z]) {
   return new (three().Vector3)(x, z, -y);
@@ -25,9 +25,9 @@ function unit(vector) {
 }
 
 /**
- * From where all `corners` are seen, looking against `direction`: {eye, target}. `wide` and `high` are the tangents
- * of the half angles to the sides and up in which they have to be, `lower` that of how far their middle is to be
- * below the middle of the view.
+ * Return a viewpoint {eye, target} from which all `corners` are seen, looking against `direction`. `wide` and `high` are the
+ * tangents of the half angles, horizontal and vertical, in which the corners must lie; `lower` is the tangent of the angle by
+ * which their middle lies below the middle of the view.
  */
 export function eyeFor(corners, direction, wide, high, lower = 0) {
   const back = unit(direction);
@@ -60,7 +60,7 @@ export class Views {
   #ahead = [0, 1];
   #standing = false;
   #following = -1;
-  #shown = ""; // "" where a person has taken the camera
+  #shown = ""; // "" after the user has moved the camera
 
   constructor(viewer) {
     this.#viewer = viewer;
@@ -75,8 +75,8 @@ export class Views {
   }
 
   /**
-   * What has to be in view, its least and greatest corner; the side that the robot works towards; whether it stands
-   * on the floor, behind its table.
+   * Set what must be in view by its least and greatest corner, the direction in which the robot works, and whether it stands on
+   * the floor, behind its table.
    */
   frame(low, high, ahead, standing) {
     this.#standing = standing;
@@ -84,13 +84,13 @@ export class Views {
     this.#ahead = ahead;
   }
 
-  /** The person takes the camera: no tip is followed any more. */
+  /** Leave the camera to the user; no fingertip is followed any more. */
   #taken() {
     this.#following = -1;
     this.#shown = "";
   }
 
-  /** The pane has another size: what was in view is so again. */
+  /** Show the same view again after the pane has changed its size. */
   again() {
     if (this.#shown && this.#shown !== "wrist") this.show(this.#shown);
   }
@@ -103,15 +103,17 @@ export class Views {
     }
     this.#following = -1;
     const [x, y] = this.#ahead;
-    const aside = this.#standing ? 1.3 : 0.62; // past the table
+    const aside = this.#standing ? 1.3 : 0.62; // looks past the table
     const direction = { all: [0.75 * x + aside * y, 0.75 * y - aside * x, 0.62], front: [x, y, 0.12], top: [-0.002 * x, -0.002 * y, 1] }[name];
     this.#look(direction);
   }
 
-  /** Stay close to a fingertip with world matrix `tip` (16, column by column; z the way it points). */
+  /**
+   * Keep the camera close to a fingertip with world matrix `tip` (16 numbers, column by column; its z axis is where it points).
+   */
   follow(tip) {
     const [at, way] = [tip.slice(12, 15), tip.slice(8, 11)];
-    const upright = Math.abs(way[2]); // 1 where it points straight down: then look at it from ahead
+    const upright = Math.abs(way[2]); // 1 if it points straight down: the camera then looks from ahead
     const aside = [this.#ahead[0] * upright, this.#ahead[1] * upright, 0.6 * (1 - upright)];
     const eye = at.map((value, axis) => value - WRIST.behind * way[axis] + WRIST.aside * aside[axis]);
     this.#place(eye, at.map((value, axis) => value + WRIST.ahead * way[axis]));

@@ -1,16 +1,16 @@
-// Short sentences in the corner of a pane about what is drawn there.
+// Short sentences in the corner of a pane about what is drawn in it.
 
 export class Tags {
   #list = document.createElement("ul");
   #tags = new Map();
 
-  /** A list of class `name` in `element`. */
+  /** Append a list of class `name` to `element`. */
   constructor(element, name) {
     this.#list.className = `tags stack ${name}`;
     element.append(this.#list);
   }
 
-  /** Say `words` under that name, with a patch of `colour` where one is given; nothing where there are no words. */
+  /** Show `words` under that name, with a patch of `colour` if given; without words, remove the entry. */
   show(name, words, colour = "") {
     let tag = this.#tags.get(name);
     if (!words) {

@@ -3,7 +3,7 @@
 export const WIDTH = 64;
 export const HEIGHT = 48;
 
-/** Correlation of two arrays of grey values, from 1, the same, down; brightness and contrast as a whole do not count. */
+/** Return the correlation of two arrays of grey values; 1 means equal. Overall brightness and contrast do not count. */
 export function correlation(a, b) {
   const [x, y] = [centred(a), centred(b)];
   let both = 0;
@@ -18,14 +18,14 @@ export function correlation(a, b) {
   return spread > 1e-6 ? both / spread : 0;
 }
 
-/** Grey values of RGBA pixels. */
+/** Return the grey values of RGBA pixels. */
 export function grey(pixels) {
   const values = new Float64Array(pixels.length / 4);
   for (let k = 0; k < values.length; k += 1) values[k] = 0.299 * pixels[4 * k] + 0.587 * pixels[4 * k + 1] + 0.114 * pixels[4 * k + 2];
   return values;
 }
 
-/** The cameras below their least match, worst first: [[name, match], ...]. */
+/** Return the cameras whose match is below `least`, worst first: [[name, match], ...]. */
 export function below(matches, least) {
   return Object.entries(matches)
     .filter(([, value]) => value < least)

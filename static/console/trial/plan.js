@@ -1,4 +1,4 @@
-// Trials of a plan: handed out one by one, given back with a reason, cameras confirmed, milestones ticked as they come.
+// Trials of a plan: handed out one by one, given back with a reason, cameras confirmed, milestones ticked during the run.
 
 import { post, RequestFailed } from "../../site/api.js";
 import { config } from "../live/config.js";
@@ -6,7 +6,7 @@ import { t } from "../../site/sentences.js";
 
 const PRESSED = "[data-next], [data-return], [data-give-back], [data-confirm-cameras], [data-override], [data-take-reference]";
 
-/** Carries out what is pressed in the panel; `act(name, work)` does one thing at a time and says what became of it. */
+/** Carries out what is pressed in the panel; `act(name, work)` does one thing at a time and reports its outcome. */
 export class PlanControls {
   #store;
   #commands;
@@ -38,10 +38,10 @@ export class PlanControls {
   async #next(plan) {
     const { trial } = await post(`${config.plans}/${plan}/next`, { station: config.station });
     await this.#commands.give("setup", {}, { trial: trial.id });
-    return null; // the command has said what became of it
+    return null; // the command has reported its outcome
   }
 
-  /** A tick gets the time of the run; one that comes too late, or before those it follows, is not taken. */
+  /** Give a ticked milestone the time of the run; refuse it if it is too late, or if an ordered form lacks an earlier one. */
   #ticked(box) {
     const form = box.form;
     const at = this.#store.snapshot?.run.elapsed ?? Number.NaN;
@@ -51,7 +51,7 @@ export class PlanControls {
     else if (box.checked && form.dataset.ordered && earlier) this.#untick(box, t("page.plan.order", "those before it come first"));
     form.elements[`at-${box.value}`].value = box.checked && Number.isFinite(at) ? at.toFixed(1) : "";
     stamps();
-    form.dispatchEvent(new Event("input", { bubbles: true })); // the draft has the time too
+    form.dispatchEvent(new Event("input", { bubbles: true })); // saves the time in the draft too
   }
 
   #untick(box, reason) {
@@ -60,7 +60,7 @@ export class PlanControls {
   }
 }
 
-/** The times of a score form: milestone id -> seconds, of what is ticked and known. */
+/** Return the times of a score form, milestone id -> seconds, for milestones that are ticked and whose time is known. */
 export function times(form) {
   const found = {};
   for (const box of form.querySelectorAll('[name="milestone"]')) {

@@ -1,4 +1,4 @@
-// Preflights: the chosen checkpoint's server is asked without the robot, and what was last found stands below the button.
+// Preflights: the chosen checkpoint's server is asked without the robot, and the newest result is shown below the button.
 
 import { post } from "../../site/api.js";
 import { setReason } from "../commands/commands.js";
@@ -6,9 +6,9 @@ import { config } from "../live/config.js";
 import { preflightProblem } from "../commands/reasons.js";
 import { t } from "../../site/sentences.js";
 
-const TIMEOUT_MS = 15000; // other stations are asked first which server they use
+const TIMEOUT_MS = 15000; // the server first asks the other stations which policy server they use
 
-/** Keeps buttons with data-preflight-ask and the results beside them true. */
+/** Keep buttons with data-preflight-ask and their results up to date. */
 export function preflights(store, commands) {
   const draw = () => {
     for (const button of document.querySelectorAll("[data-preflight-ask]")) {
@@ -55,7 +55,7 @@ async function ask(button, commands) {
   }
 }
 
-/** Say how one that was asked for on this page has ended. */
+/** Report the outcome of a preflight that was requested on this page. */
 function told(result, commands) {
   const shown = result.querySelector("[data-preflight]");
   if (shown?.dataset.preflight !== result.dataset.asked || shown.dataset.status === "running") return;

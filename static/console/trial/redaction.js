@@ -1,8 +1,8 @@
-// What tells which policy runs is not on the page while the station is veiled for who looks at it.
+// Removes from the page whatever reveals the policy while the station is redacted for this user.
 
 /** Take every [data-reveals] off the page while snapshots say "veiled", and put it back afterwards. */
 export function applyRedaction(store) {
-  const taken = []; // [what stands for it, the element]
+  const taken = []; // [comment node in its place, the element]
   const draw = () => {
     const veiled = Boolean(store.snapshot?.veiled);
     document.body.toggleAttribute("data-veiled", veiled);

@@ -1,14 +1,17 @@
-// How the bench lies in each region of the references, as the gate before a run will find it: asked of the server.
+// How well the bench matches each region of the reference pictures. The server computes it, as for the gate before a run.
 
 import { get } from "../../site/api.js";
 import { t } from "../../site/sentences.js";
 
 const LOOK_MS = 2000;
-const CROP = 96; // pixels of a picture's longer side
-const LEAST = 0.75; // where the plan has none: what lies between an object in its place and one that is not
-const AROUND = 0.5; // of a region's size, to each side of it: an object that lies beside it is seen
+const CROP = 96; // longer side of a cut-out [px]
+const LEAST = 0.75; // least match if the plan defines none; it lies between an object in its place and one that is not
+const AROUND = 0.5; // margin on each side, as a share of the region's size, which shows an object that lies next to its region
 
-/** Keeps the panel's list of regions and their outlines over the cameras; returns the names of the cameras that have any. */
+/**
+ * Keep the panel's list of regions and their outlines over the cameras up to date; return the set of names of cameras that have
+ * regions.
+ */
 export function regionView() {
   const regional = new Set();
   const images = new Map(); // address of a reference -> image
@@ -55,7 +58,7 @@ function said(words) {
   return item;
 }
 
-/** One region in words, with what the reference and the camera show there. */
+/** Return the list item for one region: a sentence, and what reference and camera show there. */
 function line(region, images) {
   const item = said(t("page.regions.line", "{camera}, {words}", { camera: region.camera, words: regionText(region) }));
   item.classList.toggle("warn", region.low);
@@ -68,12 +71,15 @@ function line(region, images) {
   return item;
 }
 
-/** Its name, its match and where its object lies. */
+/** Return a region's name, its match and where its object lies, in words. */
 export function regionText({ name, match, words, low }) {
   return t("page.regions.match", "{name}: {match}, {words}", { name, match: `${match.toFixed(2)}${low ? " !" : ""}`, words });
 }
 
-/** What is cut out of a picture around a region: [x, y, width, height] in shares, inside the picture. */
+/**
+ * Return the part of a picture that is cut out around a region, inside the picture: [x, y, width, height] as shares of its
+ * size.
+ */
 export function cropAround([x, y, width, height]) {
   const [left, top] = [Math.max(0, x - AROUND * width), Math.max(0, y - AROUND * height)];
   return [left, top, Math.min(1, x + (1 + AROUND) * width) - left, Math.min(1, y + (1 + AROUND) * height) - top];
@@ -82,7 +88,7 @@ export function cropAround([x, y, width, height]) {
 function imageOf(images, reference) {
   if (!images.has(reference)) {
     const image = new Image();
-    image.onerror = () => images.delete(reference); // asked for again
+    image.onerror = () => images.delete(reference); // load it again at the next draw
     image.src = `/pictures/${reference}.jpg`;
     images.set(reference, image);
   }
@@ -99,7 +105,7 @@ function crop(source, at, label) {
   const [wide, high] = [width * full, height * tall];
   const scale = CROP / Math.max(wide, high, 1);
   Object.assign(canvas, { width: Math.max(1, Math.round(wide * scale)), height: Math.max(1, Math.round(high * scale)) });
-  if (!full) return canvas; // not loaded yet: the next look has it
+  if (!full) return canvas; // not loaded yet: drawn at the next update
   const paper = canvas.getContext("2d");
   paper.drawImage(source, x * full, y * tall, wide, high, 0, 0, canvas.width, canvas.height);
   paper.strokeStyle = "#ffcf6b";
@@ -108,7 +114,10 @@ function crop(source, at, label) {
   return canvas;
 }
 
-/** Each region over its live picture, broken where its object is not in its place, and full where it was found instead. */
+/**
+ * Outline each region over its live picture: dashed if its object is not in its place, with a solid outline where the object
+ * was found instead.
+ */
 function outline(found) {
   for (const figure of document.querySelectorAll("[data-camera]")) {
     const mine = found.filter(({ camera }) => camera === figure.dataset.camera);

@@ -5,10 +5,13 @@ import { t } from "../../site/sentences.js";
 
 const LOOK_MS = 500;
 const BLINK_MS = 500;
-// What is drawn over the live picture: with which composite operation, and how dense.
+// How the reference is drawn over the live picture: mode -> [composite operation, opacity].
 const MODES = { blend: ["source-over", 0.5], minimum: ["darken", 1], difference: ["difference", 1], blink: ["source-over", 1], edges: ["screen", 1] };
 
-/** Keeps the overlays of the panel's reference pictures; the match stands in the panel, but of cameras that are `regional`. */
+/**
+ * Keep the overlays of the panel's reference pictures up to date, and show the match in the panel, except for cameras in
+ * `regional`, which have regions.
+ */
 export function resetAid(regional) {
   const pictures = new Map(); // address -> {image, edges}
   let mode = "";
@@ -47,11 +50,11 @@ function load(pictures, address, then) {
     pictures.set(address, { image, edges: edgesOf(image) });
     then();
   };
-  image.onerror = () => pictures.delete(address); // asked for again
+  image.onerror = () => pictures.delete(address); // load it again at the next draw
   image.src = address;
 }
 
-/** Draw the reference over the camera's picture, or take it away. The canvas below stays as it is. */
+/** Draw the reference over the camera's picture, or remove it. The canvas below stays unchanged. */
 function cover(figure, picture, mode) {
   const live = figure.querySelector("canvas");
   let over = figure.querySelector("canvas.aid-over");
@@ -77,7 +80,7 @@ function cover(figure, picture, mode) {
   paper.drawImage(mode === "edges" ? picture.edges : picture.image, 0, 0, over.width, over.height);
 }
 
-/** The match of each camera that has a reference, in words; what is below the least is marked. */
+/** Show the match of each camera that has a reference, with a mark if it is below the least match. */
 function tell(aid, pictures, regional) {
   const line = document.getElementById("aid-match");
   if (!line) return;
@@ -108,7 +111,7 @@ function small(source) {
   return grey(paper.getImageData(0, 0, WIDTH, HEIGHT).data);
 }
 
-/** White lines on black where the picture changes most. */
+/** Return a canvas with white lines on black where the picture changes most. */
 function edgesOf(image) {
   const { naturalWidth: width, naturalHeight: height } = image;
   const canvas = new OffscreenCanvas(width, height);

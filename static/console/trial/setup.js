@@ -1,22 +1,22 @@
-// The set-up: its stages while it goes on, and which one failed.
+// The stages of the set-up while it runs, and which one failed.
 
 import { formatDuration, stateLabel } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const MARKS = { done: "✓", active: "▸", waiting: "·", failed: "✕", skipped: "–" };
 
-/** Whether the stages are to be shown: while they go on, and after one failed until the next try. */
+/** Return whether the stages are to be shown: during the set-up, and after a failure until the next attempt. */
 export function isUnfinished({ state_is: is, stages = [] }) {
   return is.preparing || (is.idle && stages.some((stage) => stage.state === "failed"));
 }
 
-/** Seconds of a stage in words; nothing for one that has not begun. */
+/** Return the duration of a stage in words, or "" if it has not begun or was skipped. */
 export function stageDuration({ state, seconds }) {
   if (!Number.isFinite(seconds) || state === "waiting" || state === "skipped") return "";
   return seconds < 60 ? `${seconds.toFixed(1)} s` : formatDuration(seconds);
 }
 
-/** Keeps lists with data-stages and the buttons beside them true. */
+/** Keep lists with data-stages, and the buttons of the set-up, up to date. */
 export function setupStages(store) {
   const draw = () => {
     const { snapshot } = store;
@@ -25,7 +25,7 @@ export function setupStages(store) {
     for (const list of document.querySelectorAll("[data-stages]")) {
       list.hidden = !stages.length;
       fill(list, stages);
-      const line = list.parentElement.querySelector('[data-show="stage"]'); // says the same while it goes on
+      const line = list.parentElement.querySelector('[data-show="stage"]'); // the line below says the same during the set-up
       line.toggleAttribute("data-said", Boolean(stages.length) && snapshot.state_is.preparing);
     }
     const failed = stages.some((stage) => stage.state === "failed");

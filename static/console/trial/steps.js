@@ -1,8 +1,8 @@
-// Which of the numbered steps is the one to do now; its button alone is the primary one.
+// Which of the numbered steps is the present one; only its button is the primary one.
 
 import { collectStep } from "../../collect/actions.js";
 
-/** The step that `panel` (data of the fragment) and the live state ask for. */
+/** Return the step that `panel` (data attributes of the fragment) and the live state ask for. */
 export function currentStep({ panel, status, setUp }, snapshot) {
   const is = snapshot?.state_is;
   if (panel === "debug") {
@@ -15,7 +15,7 @@ export function currentStep({ panel, status, setUp }, snapshot) {
   return is?.preparing ? "setup" : "choose";
 }
 
-/** Show it: the steps before it are done, those after it wait. */
+/** Mark the step `now` as the present one: steps before it are done, steps after it are still to come. */
 export function showStep(steps, now) {
   let done = true;
   for (const step of steps.querySelectorAll("[data-step]")) {

@@ -1,4 +1,4 @@
-// The Eval page: a trial chosen, prepared and set up with one press, run, and scored.
+// The Eval page: a trial is chosen, prepared and set up with one press, run, and scored.
 
 import { post, RequestFailed } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
@@ -13,8 +13,8 @@ export class TrialPanel {
   #store;
   #commands;
   #panel = document.getElementById("panel");
-  #busy = ""; // what is on its way
-  #sent = {}; // the newest score: its words and the uuid it was sent with
+  #busy = ""; // name of the action under way
+  #sent = {}; // the newest score, as JSON, and the uuid with which it was sent
 
   constructor(store, commands) {
     this.#store = store;
@@ -33,12 +33,12 @@ export class TrialPanel {
     return this.#panel.querySelector("#steps").dataset;
   }
 
-  /** Fetch the fragment anew. */
+  /** Fetch the fragment again. */
   refresh() {
     window.htmx.trigger(this.#panel, "eva:trial");
   }
 
-  /** What depends on the live state: which button is blocked and why, the run's clock, the bench's own word. */
+  /** Draw what depends on the live state: which buttons are blocked and why, the run's clock, the bench's ground truth. */
   draw() {
     const { setUp, status, limit } = this.#data;
     const { snapshot } = this.#store;
@@ -89,7 +89,7 @@ export class TrialPanel {
     else this.#do(t("page.trial.save", "Save score"), () => this.#score(form));
   }
 
-  /** One thing at a time, with its outcome on the page. */
+  /** Do one action at a time and show its outcome on the page. */
   async #do(name, act) {
     if (this.#busy) {
       this.#commands.say(t("page.common.not_yet", "{name}: not yet, {busy} is on its way", { name, busy: this.#busy }), "refused");
@@ -118,7 +118,7 @@ export class TrialPanel {
     const trial = await post(config.trials, choice);
     saved(form);
     await this.#commands.give("setup", {}, { trial: trial.id });
-    return null; // the command has said what became of it
+    return null; // the command has reported its outcome
   }
 
   async #score(form) {
@@ -131,7 +131,7 @@ export class TrialPanel {
     saved(form);
   }
 
-  /** The same for the same score of a trial: where its answer was lost, Save once more adds none. */
+  /** Return the same uuid for the same score of a trial, so that Save adds no second score if the first answer was lost. */
   #uuid(trial, score) {
     const words = JSON.stringify([trial, score]);
     if (this.#sent.words !== words) this.#sent = { words, uuid: uuid() };
@@ -149,13 +149,13 @@ function saved(form) {
   form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
 }
 
-/** Phase and cause of a failure, as far as they are said; of a success nothing. */
+/** Return phase and cause of a failure as far as they are chosen; both are "" for a success. */
 function whyOf(form) {
   const said = (name) => form.querySelector(`#why:not([hidden]) [name="${name}"]:checked`)?.value ?? "";
   return { failure_phase: said("failure_phase"), failure: said("failure") };
 }
 
-/** What of a failure is asked for and not said yet; "" for nothing. */
+/** Return which required parts of the failure are not chosen yet, or "" if none. */
 function unexplained(form) {
   const levels = [...form.querySelectorAll('#why[data-explained="yes"]:not([hidden]) fieldset')];
   const open = levels.filter((level) => !level.querySelector(":checked")).map((level) => level.querySelector("legend").textContent.toLowerCase());
@@ -166,7 +166,7 @@ function saveButton() {
   return document.querySelector('[type="submit"][form="score"]');
 }
 
-/** Say what the ticks come to, and why they cannot be saved yet; a success is not asked what went wrong. */
+/** Show what the ticks amount to, and why they cannot be saved yet; a success is not asked for the causes of a failure. */
 function scoreRule() {
   const form = document.getElementById("score");
   if (!form) return;
