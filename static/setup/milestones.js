@@ -54,6 +54,10 @@ export class MilestoneList {
       row.querySelector("summary").setAttribute("aria-label", t("page.milestones.more", "More of milestone {n}", { n: index + 1 }));
     });
     document.getElementById("no-milestones").hidden = this.#all.length > 0;
+    this.#showTotal();
+  }
+
+  #showTotal() {
     const points = this.#all.reduce((sum, { points: own }) => sum + (Number(own) || 0), 0);
     document.getElementById("points").textContent = this.#all.length ? inAll(points) : "";
   }
@@ -64,7 +68,7 @@ export class MilestoneList {
     if (field.type === "checkbox") milestone[name] = field.checked;
     else if (field.type === "number") milestone[name] = field.value === "" ? (name === "points" ? 0 : null) : Number(field.value);
     else milestone[name] = field.value;
-    if (name === "points") document.getElementById("points").textContent = t("page.milestones.points", "{n} points in all", { n: this.#all.reduce((sum, { points }) => sum + points, 0) });
+    if (name === "points") this.#showTotal();
     this.#changed();
   }
 

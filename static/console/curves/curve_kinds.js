@@ -1,5 +1,6 @@
 // The kinds of curves of a joint on the live pages and in Replay, with the same names, colours and order in both.
 
+import { css } from "../live/style.js";
 import { t } from "../../site/sentences.js";
 
 /** `title` is the name that is shown, `colour` a custom property, `means` the explanation in a legend. */
@@ -12,11 +13,6 @@ export const KINDS = [
 
 /** Look of a signal of another joint in the same plot, on an axis of its own. */
 export const SECOND = { colour: "--text-strong", width: 1.5, dash: [1, 3] };
-
-/** Return the present value of a custom property of the page. */
-export function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 /** Replace NaN by null, because uPlot does not treat NaN as a missing value. */
 export function blank(values) {

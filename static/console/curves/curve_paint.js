@@ -1,6 +1,6 @@
 // Bands, hairlines and ticks on the canvas of the curves.
 
-import { css } from "./curve_kinds.js";
+import { css } from "../live/style.js";
 import { GHOSTS } from "../scene/scene_ghosts.js";
 
 const TICK = 7; // height [px]

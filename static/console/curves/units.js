@@ -1,6 +1,7 @@
 // Numbers with their units: how many digits are significant, and a unit short enough to stand beside the number.
 
-const ENDLESS = 2 * Math.PI; // bounds offered for a joint without limits: one turn each way [rad]
+/** Bounds offered for a joint without limits: one turn each way [rad]. */
+export const ENDLESS = 2 * Math.PI;
 const MOST = 4; // characters of a unit that fit beside a field
 
 /** Return the unit if it is short; "" if it consists of words, which are then shown elsewhere. */

@@ -1,10 +1,8 @@
 // Targets of moving by hand: joints by group, within their limits, and the station's answers about them.
 
 import { withLabels, splitName } from "./joint_names.js";
-import { digitsOf } from "../curves/units.js";
+import { digitsOf, ENDLESS } from "../curves/units.js";
 import { t } from "../../site/sentences.js";
-
-const ENDLESS = 2 * Math.PI; // bounds offered for a joint without limits: one turn each way [rad]
 
 /**
  * Return the joints of `facts` in groups, in order: [{name, joints: [{index, joint, label, full, lower, upper, unit,

@@ -1,6 +1,7 @@
 // The surroundings of the robot: table, mounts and ground, and on a simulated bench plate and blocks. Metres, z up.
 
-import { css, material, shape, three } from "./scene_shapes.js";
+import { css } from "../live/style.js";
+import { material, shape, three } from "./scene_shapes.js";
 
 const LEG = 0.045; // edge of a leg [m]
 const UNDER = 0.04; // depth of the ground below the table's surface if there is no floor [m]

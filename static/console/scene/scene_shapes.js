@@ -6,11 +6,6 @@ export const three = () => window.MeshCat.THREE;
 const QUARTER = Math.PI / 2;
 const made = new Map(); // geometries, shared by the robot and its ghosts
 
-/** Return the present value of a custom property of the page. */
-export function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
-
 /**
  * Return the one geometry for all shapes of a kind and size: box (x, y, z), sphere (radius), cylinder along z (radius, length).
  */

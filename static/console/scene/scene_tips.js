@@ -1,7 +1,8 @@
 // The fingertips: their paths, and the position that the camera follows.
 
 import { Path } from "./scene_path.js";
-import { css, three } from "./scene_shapes.js";
+import { css } from "../live/style.js";
+import { three } from "./scene_shapes.js";
 
 export const ARM_COLOURS = ["#4fa3ff", "#f7a04b", "#46d17f", "#c79bff"];
 
