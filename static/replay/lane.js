@@ -1,6 +1,6 @@
 // The strip over the curves that shows which chunk owns which steps, with its hairlines and bands.
 
-import { css } from "../console/curves/curve_kinds.js";
+import { css } from "../console/live/style.js";
 import { t } from "../site/sentences.js";
 
 export const LANE = 20; // height over the plot [px]

@@ -1,6 +1,7 @@
 // The curves of one joint over the whole episode, with marks of what happened behind and over them.
 
-import { AXIS, KINDS, SECOND, axes, blank, css, series, spread } from "../console/curves/curve_kinds.js";
+import { AXIS, KINDS, SECOND, axes, blank, series, spread } from "../console/curves/curve_kinds.js";
+import { css } from "../console/live/style.js";
 import { LANE, Lane } from "./lane.js";
 
 const LINES = KINDS.filter((kind) => kind.name !== "raw"); // raw is drawn chunk by chunk

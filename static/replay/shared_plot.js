@@ -1,6 +1,7 @@
 // The curves of one joint in one or several episodes: state as a solid line, executed action dashed, one colour per episode.
 
-import { axes, css, spread } from "../console/curves/curve_kinds.js";
+import { axes, spread } from "../console/curves/curve_kinds.js";
+import { css } from "../console/live/style.js";
 
 export class SharedPlot {
   #plot;
