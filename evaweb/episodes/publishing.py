@@ -1,4 +1,4 @@
-"""Target dataset of an episode, and success by its raters."""
+"""Dataset to which an episode is published, and the success of the episode according to its scores."""
 
 from __future__ import annotations
 

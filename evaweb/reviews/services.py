@@ -239,9 +239,10 @@ def record_quality(*, episode: Episode, document: Mapping[str, Any], at: datetim
 
 
 def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
-    """Record that the episode's reviews have changed; `review`, if given, becomes the one that counts.
+    """Record when the episode's reviews changed; `review`, if given, becomes the review that counts.
 
-    The time is the database's, because it is compared with publications by workers with clocks of their own.
+    The recorded time is that of the database, because it is compared with the times of publications by workers, whose
+    clocks may differ.
     """
     facts: dict[str, Any] = {"changed_at": Now()}
     if review is not None:

@@ -224,7 +224,10 @@ def resolve_unknown_outcome(*, row: Command) -> Command:
 
 
 def record_run_not_opened(*, station: Station, uuid: UUID | str, reason: str) -> None:
-    """Record for an accepted run that its recording could not be opened; its answer may still arrive later."""
+    """Record that the recording of an accepted run could not be opened.
+
+    The station's answer to the run command may still arrive later.
+    """
     Command.objects.filter(pk=parse_command_uuid(uuid), station=station, kind="run").update(unopened=reason)
 
 

@@ -19,9 +19,10 @@ def station(facts: TrialRecord) -> Station:
 
 
 def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
-    """Return the trial's evaluation.
+    """Return the evaluation of a recorded trial; create it if it does not exist.
 
-    A station's open bench is one row with a version number; the number is raised to that of the trial if it is lower.
+    Trials outside of a plan belong to the station's open bench, which is one row with a version number. If the version
+    number of this row is lower than that of the trial, it is raised to that of the trial.
     """
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         row, _ = Evaluation.objects.get_or_create(

@@ -586,8 +586,9 @@ def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
 
 
 def _idle_gaps(runs: Iterable[AttemptRecord]) -> dict[int, float]:
-    """Return by attempt number the time between the end of the previous attempt at the same station and its
-    start [s].
+    """Return for each attempt how long its station was idle before it [s], by attempt number.
+
+    This is the time from the end of the previous attempt at the same station to the start of the attempt.
     """
     ended: dict[str, datetime] = {}
     gaps = {}

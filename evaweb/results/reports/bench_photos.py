@@ -1,4 +1,7 @@
-"""Bench layouts of a plan's trials for its report: each camera's image, and the reference at that time."""
+"""Images of the bench before each trial of a plan, for the plan's report.
+
+For each trial and camera, the report contains the image and the reference with which the image was compared then.
+"""
 
 from __future__ import annotations
 

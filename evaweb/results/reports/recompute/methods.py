@@ -167,7 +167,11 @@ def _highest(function: Callable[[float], float], low: float, high: float, parts:
 
 
 def better(x1: int, n1: int, x2: int, n2: int) -> float:
-    """Return the probability that the first rate is higher, with uniform priors: Beta(a, b) above Beta(c, d)."""
+    """Return the probability that the first rate is higher than the second, with uniform priors.
+
+    `x1` of `n1` and `x2` of `n2` trials succeeded. The rates are distributed as Beta(a, b) and Beta(c, d), with a = x1
+    + 1, b = n1 - x1 + 1, c = x2 + 1, d = n2 - x2 + 1.
+    """
     a, b, c, d = x1 + 1, n1 - x1 + 1, x2 + 1, n2 - x2 + 1
 
     def log_beta(p: float, q: float) -> float:
@@ -268,8 +272,10 @@ def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
 
 
 def _hypergeometric(n1: int, n2: int, successes: int) -> tuple[int, list[float]]:
-    """Return the smallest number of the first arm's successes with these margins, and the probabilities from
-    there on.
+    """Return the probabilities of the first arm's numbers of successes, given `successes` of both arms together.
+
+    The arms have `n1` and `n2` trials. The first return value is the smallest possible number of successes of the first
+    arm. The second is the probability of this number and of each larger possible one.
     """
     least, most = max(0, successes - n2), min(n1, successes)
     whole = math.comb(n1 + n2, successes)
