@@ -44,7 +44,7 @@ _UUID = re.compile(r"[0-9a-f]{4,32}")
 
 @dataclass(frozen=True, slots=True)
 class FoundItem:
-    """Item: name, details and address."""
+    """Item that a search has found, with its name, details and address."""
 
     title: str
     detail: str

@@ -251,7 +251,11 @@ def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
 
 
 def _locked_episode(episode: Episode) -> None:
-    """Lock the episode's row, for a single writer of its file. Raises: Conflict while it is being recorded."""
+    """Lock the episode's row, so that only one process at a time writes the episode's review file.
+
+    Raises:
+        Conflict: While the episode is being recorded.
+    """
     row = Episode.objects.select_for_update().get(pk=episode.pk)
     if row.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_REVIEW(uuid=episode.uuid))

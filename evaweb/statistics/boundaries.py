@@ -346,7 +346,11 @@ def _checked(counts: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 def _add_trials(
     alive: NDArray[np.float64], first: int, second: int, rates: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return the probabilities of tables after `first` and `second` more trials of each arm."""
+    """Return the probabilities of the tables after further trials.
+
+    `alive` are the probabilities of the tables before these trials. `first` and `second` are the numbers of further
+    trials of the two arms, and `rates` are the success rates of the arms.
+    """
     import numpy as np
 
     for axis, (more, rate) in enumerate(zip((first, second), rates, strict=True)):

@@ -43,7 +43,7 @@ class Outcome:
 
     @property
     def condition(self) -> str:
-        """Initial condition without its repetition."""
+        """Initial condition as SCENE/POSITION; all repetitions of it have the same text."""
         return f"{self.scene}/{self.position}"
 
 

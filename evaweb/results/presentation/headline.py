@@ -368,7 +368,10 @@ def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
 def conclude_alone(
     plan: Plan, single: Design, number: int, blocks: Sequence[Block]
 ) -> tuple[str, Conclusion]:
-    """Return sentence and conclusion of comparison `number` from these blocks by the design `single`."""
+    """Return the sentence and the conclusion of comparison `number` of the plan.
+
+    The conclusion is drawn from `blocks` by the design `single`.
+    """
     names = compared(plan.document or {})[number]
     pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
     conclusion = evaluate_design(single, blocks, pair)

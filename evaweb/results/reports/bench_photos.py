@@ -29,7 +29,7 @@ _FIELDS = (
 
 
 def layout_rows(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    """Yield rows, one for each camera of each attempt."""
+    """Yield pages of rows; there is one row for each camera of each attempt."""
     rows = Achieved.objects.filter(trial__evaluation=plan.evaluation_id).order_by("trial_id", "pk")
     yield [dict(zip(COLUMNS, row, strict=True)) for row in rows.values_list(*_FIELDS)]
 

@@ -1,4 +1,7 @@
-"""Record of a reveal in addition to the blocks that count, so that reports show later changes."""
+"""Facts that are recorded at a plan's reveal, so that its reports show later changes.
+
+They are recorded in addition to the blocks that count.
+"""
 
 from __future__ import annotations
 

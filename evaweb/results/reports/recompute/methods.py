@@ -29,7 +29,10 @@ def student_t(freedom: int) -> float:
 
 
 def _within(angle: float, freedom: int) -> float:
-    """Return the probability of t between -x and x, for x = tan(angle) sqrt(freedom)."""
+    """Return the probability that a variable with Student's t distribution is between -x and x.
+
+    Here x = tan(angle) sqrt(freedom), and `freedom` is the number of degrees of freedom.
+    """
     cosine, sine = math.cos(angle), math.sin(angle)
     term, total = (1.0, 0.0) if freedom % 2 == 0 else (cosine, 0.0)
     for k in range(freedom // 2):
@@ -335,10 +338,10 @@ def score_bets(differences: Sequence[float]) -> list[float]:
 
 
 def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
-    """Return the interval of means that no bet has refuted after any pair, or None if it is empty.
+    """Return the interval of those mean differences that the bets have not refuted; None if the interval is empty.
 
-    The bets are those of `score_bets`. They are placed on the differences rescaled so that -1 stays -1 and the tested
-    mean becomes 0.
+    A mean is refuted if a bet against it has won enough after any pair. The bets are those of `score_bets`. For each
+    tested mean, the differences are rescaled first, such that the tested mean becomes 0 and -1 remains -1.
     """
 
     def refuted(values: Sequence[float]) -> float:
@@ -353,11 +356,10 @@ def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
 
 
 def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
-    """Return the two-sided probability of a sum of differences as large as the observed one if each sign is equally
-    likely.
+    """Return the two-sided probability of a sum of differences as large as the observed one.
 
-    The probability is computed in integers: the coefficients of the product of all (1 + x^d), packed into one long
-    number.
+    The probability holds if each difference is equally likely to have either sign. It is computed in integers, from the
+    coefficients of the product of all (1 + x^d); all coefficients are packed into one long number.
     """
     units: list[int] = []
     for parts in (25_200, 2_520, 420, 60, 12):
