@@ -23,7 +23,10 @@ def client_address(request: HttpRequest) -> str | None:
 
 
 def lockable_of(request: HttpRequest) -> str | None:
-    """Return the address at which names are locked; for IPv6 the network address of the subscriber's /64."""
+    """Return the address for which a user name is locked after failed logins; None if it is unknown.
+
+    For IPv6 this is the network address of the subscriber's /64.
+    """
     address = _parsed(client_address(request))
     if isinstance(address, IPv6Address):
         return str(ip_network((address, _ONE_SUBSCRIBER), strict=False).network_address)

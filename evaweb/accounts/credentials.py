@@ -239,7 +239,11 @@ class CredentialCache:
         return login
 
     def _resolve_unknown(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
-        """Start looking up an uncached credential; the coroutine returns its user or why it is unknown."""
+        """Start to look up an uncached credential in the turn of `share`.
+
+        The returned coroutine results in the login, or in None if the credential belongs to no user. If the database
+        cannot answer, it results in the exception that says why.
+        """
         if self._is_known_as_nobodys((kind, digest(secret))):
             return self._cached(None)
         return self._cached(self._check(kind, secret, share))

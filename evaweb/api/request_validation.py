@@ -100,7 +100,10 @@ class BoundedParser(Parser):
 
 
 def _without_unknown(body: Any) -> Any:
-    """Return the body; the body of a stop without its unknown fields, because they must not prevent the stop."""
+    """Return the body of a request; the unknown fields are removed if the request is a stop.
+
+    Unknown fields must not prevent a stop.
+    """
     from evaweb.api.stations import CommandIn  # imported here: stations is validated by this module
 
     if not _stops(body):

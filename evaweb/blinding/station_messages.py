@@ -154,7 +154,11 @@ def _whole(text: Sentence) -> str | None:
 
 
 def _with_parts(text: Sentence) -> str | None:
-    """Return the message with its nested messages redacted; None if one is hidden or contains foreign text."""
+    """Return the message with the messages nested in it redacted.
+
+    The result is None if a nested message must be hidden entirely, or if an argument of the message is a text of
+    unknown origin.
+    """
     message, whole = plain(text), True
     for name, of in text.arguments.items():
         if isinstance(of, Sentence):

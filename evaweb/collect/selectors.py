@@ -46,7 +46,10 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """Target dataset of a session: name and version, "" if it does not exist yet."""
+    """Target dataset of a session.
+
+    `version` is the format version of the dataset, "" if the dataset does not exist yet.
+    """
 
     name: str
     version: str

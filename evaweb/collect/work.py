@@ -115,7 +115,7 @@ def _queue_order(item: QueueItem) -> tuple[int, object]:
 
 
 def _seconds_per_frame(kind: str) -> float | None:
-    """Return the average of the last finished jobs of that kind [s]; None if there are none."""
+    """Return the average time per frame of the last finished jobs of that kind [s]; None if there are none."""
     completed = Job.objects.filter(
         kind=kind, status=JobStatus.DONE, claimed_at__isnull=False, finished_at__isnull=False
     )

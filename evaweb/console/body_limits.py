@@ -152,8 +152,9 @@ class BoundedRequest(WebRequest):
         super().connectionLost(reason)
 
     def admitted(self) -> None:
-        """Do nothing; a subclass overrides this to react when a client is granted a long body, which may take time to
-        arrive.
+        """Do nothing; a subclass overrides this to react when a client is allowed to send a long body.
+
+        Such a body may take time to arrive.
         """
 
     def _too_long(self) -> None:

@@ -1,7 +1,7 @@
 """Detection of changes in a station's database rows, whichever process made them.
 
-Each web process polls the database once per second while a page is open, so that workers and other processes need no
-further message channel to it.
+Each web process polls the database once per second while a page is open. Workers and other processes therefore need no
+message channel to the web process.
 """
 
 from __future__ import annotations

@@ -320,7 +320,7 @@ class UnknownAddressConsumer(AsyncWebsocketConsumer):
     channel_layer_alias = ""
 
     async def connect(self) -> None:
-        """Accept, and close with a code."""
+        """Accept the connection, and close it at once with code NO_STATION."""
         await self.accept()
         await self.close(NO_STATION, "there is nothing at this address")
 

@@ -1,4 +1,7 @@
-"""Flow control of pages: a message quota that never counts stops, and turns of the event loop for requests."""
+"""Flow control of pages: a message quota, and a scheduler for requests.
+
+The quota never counts stops. The scheduler starts only some requests in each turn of the event loop.
+"""
 
 from __future__ import annotations
 

@@ -61,7 +61,10 @@ class Day:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Week of one station; `covered` is the number of recordings of blind trials, which are left out."""
+    """Figures of one station for the last week, day by day.
+
+    `covered` is the number of recordings of blind trials, which are left out.
+    """
 
     station: Station
     days: Sequence[Day]

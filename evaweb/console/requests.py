@@ -96,7 +96,10 @@ Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
 def may_be_stop(text: str) -> bool:
-    """Return True if a message may stop a robot; for this it need not be parsed completely."""
+    """Return True if a message of a page may stop a robot.
+
+    A message that cannot be parsed completely may count as a stop too.
+    """
     if pressing.parse_json_press(text, "type") is not None:
         return True
     return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))

@@ -44,7 +44,7 @@ def still_of(station: Station) -> bytes:
 
 
 def _fetch(station: Station, cameras: list[str]) -> bytes:
-    """Return the image, b"" if no image came in time."""
+    """Return a current JPEG of the first of the `cameras`; b"" if an image did not come in time."""
     try:
         return image_store.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
     except Conflict:

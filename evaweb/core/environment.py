@@ -172,7 +172,13 @@ def store() -> Path | Bucket | None:
 
 
 def _endpoint(name: str) -> str:
-    """Return the origin in a setting, "" if it is not set; it is inserted unescaped into the security policy."""
+    """Return the origin that the environment variable `name` sets, "" if it is not set.
+
+    The origin is inserted unescaped into the content security policy, and therefore checked.
+
+    Raises:
+        ImproperlyConfigured: If the value is not an origin.
+    """
     origin = os.environ.get(name, "").strip().rstrip("/")
     parts = urlsplit(origin)
     whole = f"{parts.scheme}://{parts.netloc}"

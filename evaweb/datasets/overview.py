@@ -87,7 +87,7 @@ class Overview:
 
     @property
     def short(self) -> str:
-        """Name without the usual folder."""
+        """Name of the dataset without the prefix `datasets/`."""
         return self.name.removeprefix("datasets/")
 
 

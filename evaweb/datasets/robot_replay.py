@@ -59,7 +59,10 @@ RATE = 5.0  # inference rate [Hz]; each chunk covers at least a second
 
 @dataclass(frozen=True, slots=True)
 class PlayableEpisode:
-    """Episode for replay on a robot; `columns` maps spaces to the dataset's columns."""
+    """Episode for replay on a robot.
+
+    `columns` maps each action space to the dataset's column with the values in this space.
+    """
 
     source: str  # name in URLs
     title: str

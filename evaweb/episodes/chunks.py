@@ -1,4 +1,7 @@
-"""Chunks of the policy: observation and arrival times, delays, planned rows."""
+"""Chunks with which the policy answered in an episode: their times, delays and planned rows.
+
+The times are those of the observation and of the chunk's arrival.
+"""
 
 from __future__ import annotations
 

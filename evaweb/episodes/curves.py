@@ -184,7 +184,10 @@ def _ticks(episode: Episode, start: float, contributions: Array) -> Stream:
 
 
 def _raw(episode: Episode, start: float) -> Stream:
-    """Return the policy's raw actions by step; dropped rows and chunks in another space are omitted."""
+    """Return the raw actions of the policy by step.
+
+    Rows that were dropped, and chunks that are not in joint space, are omitted. Times are counted from `start` [s].
+    """
     raw, dim = episode.raw, episode.layout.dim
     spaces = sorted(set(raw.column("space").to_pylist()))
     lengths = raw.column("action").combine_chunks().value_lengths().to_numpy(zero_copy_only=False)

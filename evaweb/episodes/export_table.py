@@ -68,7 +68,10 @@ def table_file(uuid: UUID) -> Path:
 
 
 def table_of(*, episode: Episode) -> Table:
-    """Return the state of the table, from the disk and its newest job; "none" for an unfinished episode."""
+    """Return the state of an episode's export table; "none" for an unfinished episode.
+
+    The state follows from the files on disk and from the newest job that makes the table.
+    """
     if episode.away_since or episode.status in (EpisodeStatus.RECORDING, EpisodeStatus.MISSING):
         return Table("none")
     try:

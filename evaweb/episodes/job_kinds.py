@@ -188,7 +188,7 @@ def find_closed_episodes() -> int:
 
 @periodic_task("arrived recordings")
 def look_for_arrived() -> int:
-    """Add rows of episodes that arrived from stations on other computers."""
+    """Add rows of episodes that arrived from stations on other computers; return the number of these episodes."""
     return ingest_arrived()
 
 

@@ -1,4 +1,4 @@
-"""Target dataset of an episode, and success by its raters."""
+"""Dataset to which an episode is published, and the success of the episode according to its scores."""
 
 from __future__ import annotations
 
@@ -30,11 +30,14 @@ def success_of(path: Path) -> bool | None:
 
 
 def dataset_name(recorded: RecordedEpisode, *, scored: bool, simulated: bool) -> str:
-    """Return the name of the dataset that an episode goes to.
+    """Return the name of the dataset to which an episode is published.
 
-    There is one per robot and kind (rollouts or demonstrations), with simulated episodes and unscored rollouts apart.
-    An episode of a collection session goes to the session's dataset instead.
-    Raises: RecordingError if the name of the robot or of the session's dataset cannot be a folder's.
+    There is one dataset per robot and kind of episode (rollouts or demonstrations). Simulated episodes and unscored
+    rollouts have datasets of their own. An episode of a collection session is published to the session's dataset
+    instead.
+
+    Raises:
+        RecordingError: If the name of the robot, or of the session's dataset, cannot be the name of a folder.
     """
     if recorded.session.get("dataset"):
         return session_dataset(str(recorded.session["dataset"]), simulated=simulated)

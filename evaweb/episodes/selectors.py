@@ -133,7 +133,11 @@ def tag_counts(*, sight: Visibility = FULL_VISIBILITY) -> dict[str, int]:
 
 
 def _by_someone(visible: Q, author: str, visibility: Visibility) -> Q:
-    """Return the condition for opinions that this user may see: those on episodes in `visible`, and their own."""
+    """Return the condition for opinions of people (reviews and tags) that this user may see.
+
+    These are the opinions on the episodes that match `visible`, and the user's own opinions. `author` is the query path
+    to the author of an opinion.
+    """
     return Q() if visibility.hides_nothing else visible | Q(**{author: visibility.user})
 
 

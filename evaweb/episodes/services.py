@@ -219,7 +219,10 @@ def request_publish(*, episode: Episode, version: str = "") -> Job | None:
 
 
 def close_unheard_episodes() -> int:
-    """Close rows whose recordings were closed without an event, as by repair; return their number."""
+    """Close the rows of episodes whose recordings were closed without an event; return the number of these rows.
+
+    For example, a repair closes a recording without an event.
+    """
     closed = 0
     for uuid in Episode.objects.filter(status=EpisodeStatus.RECORDING).values_list("uuid", flat=True):
         if (journal_folder(uuid) / "outcome.json").exists():

@@ -23,7 +23,8 @@ QUALITY = 70
 class Grid:
     """Layout of a sheet of `across` x `down` tiles, which are filled row by row from the top left.
 
-    Tile k shows one image of `every` consecutive rows of the episode, the first of which is k * `every`.
+    A tile stands for a number of consecutive rows of the episode, given by `every`, and shows one image of them. Tile k
+    starts at row k * `every`.
     """
 
     every: int

@@ -66,9 +66,10 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
 
 
 def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
-    """Store the result of a verification on disk and in the row.
+    """Store the result of an episode's verification on disk and in the episode's database row.
 
-    Returns: The result after the comparison with the row (see `compare_with_row`).
+    Returns:
+        The result after the comparison with the database row (see `compare_with_row`).
     """
     row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
     verdict = compare_with_row(row, verdict) if row else verdict

@@ -1,4 +1,7 @@
-"""Videos of Replay in their two places: preview folder, or the lab's store by digest."""
+"""Videos of Replay in their two places: an episode's preview folder, or the lab's object store.
+
+In the store, a video is found by its digest.
+"""
 
 from __future__ import annotations
 

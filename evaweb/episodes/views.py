@@ -127,7 +127,7 @@ def _export_asked(request: HttpRequest, episode: Episode) -> HttpResponse:
 
 
 def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Show the state of the table, as a fragment that polls."""
+    """Show the state of the episode's export table, as a fragment of a page that polls."""
     episode = episode_get(uuid=uuid)
     context = {"episode": episode, "table": table_of(episode=episode)}
     return render(request, "episodes/table.html", context)

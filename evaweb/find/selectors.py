@@ -44,7 +44,7 @@ _UUID = re.compile(r"[0-9a-f]{4,32}")
 
 @dataclass(frozen=True, slots=True)
 class FoundItem:
-    """Item: name, details and address."""
+    """Item that a search has found, with its name, details and address."""
 
     title: str
     detail: str
@@ -227,7 +227,7 @@ def _trials(query: str) -> list[FoundItem]:
 
 
 def _numbers(digits: str) -> Iterator[tuple[int, int]]:
-    """Yield the ranges of numbers with these leading digits, one per length."""
+    """Yield the ranges (first, last) of the numbers that begin with these digits: one range per number of digits."""
     for more in range(_DIGITS - len(digits) + 1):
         yield int(digits) * 10**more, (int(digits) + 1) * 10**more - 1
 

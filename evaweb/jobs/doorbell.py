@@ -10,7 +10,11 @@ TASK = "evaweb.jobs.work"  # sent by name: the task's module enqueues jobs itsel
 
 
 def notify_workers(queue: str) -> bool:
-    """Notify the broker; return False if it did not accept: a worker finds the row at its next poll."""
+    """Notify the workers of a queue of a new job, through the broker.
+
+    Returns:
+        False if the broker did not accept the notification; a worker then finds the job's row at its next poll.
+    """
     from celery.exceptions import CeleryError  # imported late: most programs never notify
     from kombu.exceptions import KombuError
 

@@ -192,7 +192,12 @@ def _lapsed(job: Job) -> None:
 def hold(job: Job, names: Collection[str]) -> None:
     """Wait until no other running job holds any of `names`, then hold them until this job ends.
 
-    They replace the names that this job held before, so that two jobs cannot deadlock. Raises: JobTakenOver, Cancelled.
+    A name stands for something that only one job may work on, such as a dataset. The new names replace those that this
+    job held before, so that two jobs cannot deadlock.
+
+    Raises:
+        JobTakenOver: If another worker has the job now.
+        Cancelled: If the job was cancelled.
     """
     while (by := retry_while_locked(partial(_acquire_names, job, sorted(set(names))))) is not None:
         _tell(job, f"waits for another job at work on the same: {by}")
@@ -275,7 +280,10 @@ def _ended_if_cancelled(row: QuerySet[Job]) -> bool:
 
 
 def _requeue_row(row: QuerySet[Job], **facts: Any) -> bool:
-    """Queue the job again unless it was cancelled; if a newer job of its key is queued, fail it in favour of that."""
+    """Queue the job again unless it was cancelled.
+
+    If a newer job with the same key is queued already, this job is failed, and the newer one does its work.
+    """
     if _ended_if_cancelled(row):
         return True
     try:

@@ -1,4 +1,4 @@
-"""Tasks that celery calls, one line each."""
+"""Tasks that celery calls; each only calls a service."""
 
 from __future__ import annotations
 

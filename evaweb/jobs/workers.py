@@ -143,7 +143,11 @@ def waiting_for(job: Job) -> str:
 
 
 def queue_names(given: str) -> list[str]:
-    """Return the distinct queues of an option. Raises: EvaError, which lists the allowed ones."""
+    """Return the distinct queues that the value of option --queues names, separated by commas.
+
+    Raises:
+        EvaError: If a name is not a queue, or if there is none; the message lists the allowed queues.
+    """
     requested = {name.strip() for name in given.split(",") if name.strip()}
     if not requested or not requested <= set(Queue):
         raise EvaError(f"--queues {given!r:.120}: allowed: {', '.join(Queue)}, with commas between them")

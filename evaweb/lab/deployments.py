@@ -269,7 +269,7 @@ def try_again(*, name: str) -> None:
 
 
 def remove(*, name: str) -> None:
-    """Remove a deployment; the lab then ends the programs that it started for it.
+    """Remove a deployment; the lab then ends the programs that it has started for this deployment.
 
     A station without any history or plan is deleted too; any other is deactivated.
 

@@ -1,4 +1,7 @@
-"""Starting of deployments that are written to the data folder while the lab runs, without blocking its watch loop."""
+"""Starting of deployments that are written to the data folder while the lab runs.
+
+The lab's watch loop is not blocked meanwhile.
+"""
 
 from __future__ import annotations
 

@@ -67,7 +67,10 @@ def simulated_options(parser: ArgumentParser) -> None:
 
 
 def benches_of(options: Mapping[str, Any]) -> Benches:
-    """Return the settings from these options, with --seed if there is one."""
+    """Return the settings of the simulated benches that these command-line options request.
+
+    The options may lack --seed; the default seed is used then.
+    """
     return Benches(options.get("seed", Benches.seed), options["pictures"], options["set"])
 
 

@@ -344,9 +344,10 @@ def end_at_request(plan: Plan) -> str:
 
 
 def crossed_while_waiting(plan: Plan, since: datetime) -> str:
-    """Return why the plan would have ended at or after `since`, but for an open void request; "" if it would not.
+    """Return the reason for which the plan would have ended if no void request had been open; "" if there is none.
 
-    Such an end was recorded when a trial was requested while the void request was open.
+    Only reasons that were recorded at or after `since` count. A reason is recorded when a trial is requested while the
+    void request is open.
     """
     text = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
     return text or ""
@@ -397,7 +398,9 @@ def recorded_so_far(plan: Plan) -> Hashable:
 
 
 def counted_now(plan: Plan) -> dict[str, Any]:
-    """Return the counting blocks, and the sums of each checkpoint."""
+    """Return the blocks that count now, and for each checkpoint its numbers of trials and successes and its mean
+    score.
+    """
     return {
         "blocks": [[list(trial) for trial in block] for block in current_pairs(plan).counted]
         if frozen_design(plan.document or {}) is not None

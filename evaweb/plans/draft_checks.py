@@ -29,7 +29,10 @@ class Remark:
 
 
 def problems(plan: Plan) -> Iterator[Remark]:
-    """Yield everything that prevents freezing, except a random order that does not fit: freezing draws another one."""
+    """Yield everything that prevents freezing the plan.
+
+    A random order that does not fit the design is no problem, because freezing draws another order.
+    """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     if not plan.positions.exists():
         yield Remark("conditions", f"{plan} has no position: choose initial conditions")
@@ -58,7 +61,10 @@ def _served(plan: Plan) -> Iterator[Remark]:
 
 
 def covered(plan: Plan, sight: Visibility) -> Callable[[str], str]:
-    """Return a function that replaces the names of checkpoints hidden from this user in a message."""
+    """Return a function that takes a message and covers the names of checkpoints in it.
+
+    The function replaces the names of those checkpoints that are hidden from the user with this `sight`.
+    """
     rows = [*plan.checkpoints.filter(pk__in=sight.checkpoints), *filter(None, (plan.first, plan.second))]
     names = sorted({row.name for row in rows if row.pk in sight.checkpoints}, key=len, reverse=True)
 

@@ -50,7 +50,10 @@ def first_reveal(plan: Plan) -> RevealLine | None:
 def write_reveal(plan: Plan, user: User, at: datetime) -> None:
     """Write the journal line of a reveal, or of the close of an open plan.
 
-    `plan.at_reveal` is completed with user, commitment and key. Call it before the row is saved. Raises: NotWritten.
+    The function adds user, commitment and key to `plan.at_reveal`. It must be called before the plan's row is saved.
+
+    Raises:
+        NotWritten: If the line could not be written.
     """
     by = user.get_username()
     if plan.at_reveal is not None:

@@ -5,8 +5,9 @@ nearly the same time (Kress-Gazit et al. 2024). Rounds cover all conditions befo
 each block is drawn independently, so that earlier blocks reveal nothing about it. (Plans up to format 5 used rows of
 Latin squares, in which one recognised trial revealed parts of later blocks.)
 
-Random: a block has two trials, each of one of two checkpoints by a fair coin, except that a checkpoint `IMBALANCE`
-trials behind at that condition comes next (the big stick design, Soares and Wu 1983), so few trials are predictable.
+Random: a block has two trials. A fair coin decides for each trial which of the two checkpoints it tries. If one of them
+is `IMBALANCE` trials behind at this initial condition, it comes next without a coin (the big stick design, Soares and
+Wu 1983). Therefore only few trials are predictable.
 """
 
 from __future__ import annotations
@@ -138,8 +139,9 @@ def _orders(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
 
 
 def foretold(checkpoints: int, allocation: str) -> str:
-    """Return as text how many and which trials an operator who recognises every checkpoint can predict despite
-    blinding.
+    """Return as text how many trials can be predicted despite blinding, and which.
+
+    It is assumed that the operator recognises every checkpoint.
     """
     share = checkpoints if allocation == PAIRED else 2 * IMBALANCE
     which = (

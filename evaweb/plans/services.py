@@ -446,7 +446,10 @@ def _close(plan: Plan, user: User, reason: str) -> None:
 
 
 def _store_at_close(plan: Plan, user: User) -> None:
-    """Store the result of an open plan at its close; computed before locking, as that may take seconds."""
+    """Store the result of an open plan when the plan is closed.
+
+    The result is computed before the plan is locked, because the computation may take seconds.
+    """
     while True:
         fresh = Plan.objects.get(pk=plan.pk)
         at, record = recorded_so_far(fresh), reveal_record(fresh)

@@ -91,7 +91,7 @@ class Preflight(models.Model):
 
     @property
     def label(self) -> str:
-        """Outcome as text; the status without a report."""
+        """Verdict of the preflight as text; as long as there is no verdict, the preflight's status."""
         if self.verdict in Verdict.values:
             return str(Verdict(self.verdict).label)
         return self.verdict or str(PreflightStatus(self.status).label)

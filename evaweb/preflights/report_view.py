@@ -86,6 +86,6 @@ def _rows(chunk: Any) -> str:
 
 
 def _call(call: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the name of a call, and its duration with a note."""
+    """Return the name of one call to the policy server, and the duration of the call with a note."""
     how = str(call["note"]) if call.get("note") else "" if call["ok"] else "failed"
     return str(call["name"]), _ms(call["ms"]) + (f" ({how})" if how else "")

@@ -137,7 +137,11 @@ class AutomaticJudge(models.Model):
         return Setup(self.address, self.model, self.key_variable, self.plain, self.patience_s)
 
     def clean(self) -> None:
-        """Check that its module can build a judge from this set-up."""
+        """Check that the module of this kind of judge can build a judge from this set-up.
+
+        Raises:
+            ValidationError: If the module cannot.
+        """
         try:
             build_judge(self.name, self.kind, self.setup)
         except EvaError as fault:

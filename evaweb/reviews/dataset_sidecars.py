@@ -25,7 +25,10 @@ def review_lines(uuid: UUID) -> dict[str, Sequence[AnyReview]]:
 
 @register_sidecar_writer
 def write_review_sidecars(uuid: UUID, folder: Path) -> Mapping[str, Path]:
-    """Write the sidecar files to `folder` and return them by kind; empty kinds have no file."""
+    """Write the sidecar files to `folder` and return them by kind.
+
+    A kind of which the episode has no reviews gets no file.
+    """
     paths = {}
     for kind, reviews in review_lines(uuid).items():
         if reviews:

@@ -239,9 +239,10 @@ def record_quality(*, episode: Episode, document: Mapping[str, Any], at: datetim
 
 
 def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
-    """Record that the episode's reviews have changed; `review`, if given, becomes the one that counts.
+    """Record when the episode's reviews changed; `review`, if given, becomes the review that counts.
 
-    The time is the database's, because it is compared with publications by workers with clocks of their own.
+    The recorded time is that of the database, because it is compared with the times of publications by workers, whose
+    clocks may differ.
     """
     facts: dict[str, Any] = {"changed_at": Now()}
     if review is not None:
@@ -250,7 +251,11 @@ def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
 
 
 def _locked_episode(episode: Episode) -> None:
-    """Lock the episode's row, for a single writer of its file. Raises: Conflict while it is being recorded."""
+    """Lock the episode's row, so that only one process at a time writes the episode's review file.
+
+    Raises:
+        Conflict: While the episode is being recorded.
+    """
     row = Episode.objects.select_for_update().get(pk=episode.pk)
     if row.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_REVIEW(uuid=episode.uuid))

@@ -116,7 +116,10 @@ class ComputeProcess:
 
 
 class Questions:
-    """Queue of computations that `run` executes one at a time, users in turn, with cached results. Thread-safe."""
+    """Queue of computations with cached results; `run` executes them one at a time.
+
+    The users take turns, so that a user with many computations does not delay the others. The queue is thread-safe.
+    """
 
     def __init__(
         self,
@@ -226,7 +229,7 @@ def _main() -> None:
 
 
 def _end_with(descriptor: int) -> None:
-    """Exit when the parent closes the socket: its result is not needed any more."""
+    """Exit this process when the parent process closes the socket: the parent does not need the result any more."""
     gone = select.poll()
     gone.register(descriptor, select.POLLRDHUP)
     gone.poll()

@@ -66,7 +66,7 @@ def lockout_response(request: HttpRequest, *given: Any) -> HttpResponse:
 
 
 def _name_until(request: HttpRequest) -> datetime:
-    """Return when the lock of the user name at this address ends."""
+    """Return when the user name of this request can be used again from the address of this request."""
     username = (getattr(request, "axes_credentials", None) or {}).get("username")
     attempts = AccessAttempt.objects.filter(username=username, ip_address=lockable_of(request))
     newest: datetime = attempts.aggregate(at=Max("attempt_time"))["at"] or timezone.now()

@@ -47,7 +47,10 @@ def scheme_of(scope: Mapping[str, Any]) -> str:
 
 
 def origin_at_port(host: str, web_port: int, port: int) -> str:
-    """Return the plain-HTTP origin at `port`; "" if `host` does not have the web's own port but a proxy's."""
+    """Return the plain-HTTP origin at `port` of the host that the browser used.
+
+    Returns "" if the port in `host` is not the web server's own port `web_port`: the request then came through a proxy.
+    """
     name, host_port = _parts(host)
     return f"http://{name}:{port}" if host_port == web_port else ""
 

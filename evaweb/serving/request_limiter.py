@@ -140,7 +140,11 @@ class _Client:
             self._waits.cancel()
 
     async def unless_gone(self, turn: Coroutine[Any, Any, Any]) -> None:
-        """Wait for `turn`. Raises: CancelledError if the client hangs up first."""
+        """Await the coroutine `turn`, with which the request waits for its turn.
+
+        Raises:
+            CancelledError: If the client hangs up first.
+        """
         self._waits = asyncio.create_task(turn)
         if self._gone:
             self._waits.cancel()

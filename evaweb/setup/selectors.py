@@ -1,4 +1,4 @@
-"""Overview of a lab's contents and of what is missing: a card for each kind."""
+"""Overview of what a lab has and what is missing, as cards: scenes, checkpoints, plans, people and stations."""
 
 from __future__ import annotations
 

@@ -78,7 +78,10 @@ def sheet(request: HttpRequest, name: str) -> HttpResponse:
 
 @require_POST
 def preview(request: HttpRequest) -> JsonResponse:
-    """Return the operator's set-up and score cards of a scene that need not be saved."""
+    """Return the cards of a scene for set-up and scoring, as the operator would see them.
+
+    The scene is in the request, so that it can be previewed before it is saved.
+    """
     body = _posted(request)
     return JsonResponse({"html": editing.operators_view(request, body.get("scene"), body.get("position"))})
 
@@ -118,7 +121,11 @@ def _posted(request: HttpRequest) -> dict[str, Any]:
 
 
 def _written(request: HttpRequest, name: str | None) -> JsonResponse:
-    """Write the scene; answer with its address, remarks and state, or with each faulty place."""
+    """Write the scene of the request, and answer with the address of the scene, with remarks and the scene's state.
+
+    `name` is the scene to be changed; None creates one. If the scene is invalid, the answer lists each faulty place. If
+    the scene has changed meanwhile, the answer says so.
+    """
     body = _posted(request)
     table = body.get("scene")
     try:

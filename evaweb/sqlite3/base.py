@@ -8,9 +8,10 @@ from django.db.backends.sqlite3 import base
 class DatabaseWrapper(base.DatabaseWrapper):
     """Connection that closes the cursor of a transaction that could not begin.
 
-    The exception refers to itself by its traceback, and so keeps the cursor alive until some thread collects garbage.
-    That thread would then reset the cursor's statement, which waits as long as the cursor's connection waits for the
-    database. If that thread itself has locked the database, both would wait for each other.
+    Otherwise two threads could wait for each other. The exception refers to itself by its traceback, and so keeps the
+    cursor alive until some thread collects garbage. The collecting thread would then reset the cursor's statement, and
+    this reset waits as long as the cursor's connection waits for the database. If the collecting thread itself has
+    locked the database, neither could continue.
     """
 
     def _start_transaction_under_autocommit(self) -> None:

@@ -224,7 +224,10 @@ def resolve_unknown_outcome(*, row: Command) -> Command:
 
 
 def record_run_not_opened(*, station: Station, uuid: UUID | str, reason: str) -> None:
-    """Record for an accepted run that its recording could not be opened; its answer may still arrive later."""
+    """Record that the recording of an accepted run could not be opened.
+
+    The station's answer to the run command may still arrive later.
+    """
     Command.objects.filter(pk=parse_command_uuid(uuid), station=station, kind="run").update(unopened=reason)
 
 
@@ -268,7 +271,8 @@ def _send(row: Command, command: messages.Command) -> Command:
 def _require_sendable(command: messages.Command) -> None:
     """Raise EvaError if the command cannot be encoded.
 
-    To be called before its row is written: the outcome of a row without an answer is queried for an hour.
+    This is to be called before the command's row is written. If a row without an answer were left behind, the station
+    would be queried for its outcome for an hour.
     """
     try:
         messages.encode(command)
@@ -345,10 +349,11 @@ def _merged_fields(row: Command, first: Command) -> list[str]:
 
 
 def _first_or_own(row: Command) -> Command | None:
-    """Return the row that this command already has, None if there is none.
+    """Return the row that this command already has in the database; None if it has none.
 
-    If the uuid belongs to another press of the e-stop or another command, an e-stop `row` gets a uuid of its own first.
-    That uuid is derived from the press, so that every writer and every repetition finds the same row.
+    The uuid of an e-stop `row` may already belong to another press of the e-stop, or to another command. In this case
+    the row gets a new uuid first. The new uuid is derived from the press, so that every writer and every repetition
+    finds the same row.
     """
     try:
         first = _find_first(row)

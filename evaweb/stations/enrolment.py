@@ -62,9 +62,13 @@ def code_make(*, user: Any, station: Station) -> Shown:
 
 @transaction.atomic
 def key_enrol(*, digest: str, key: str, computer: str) -> Station:
-    """Make `key` the key of the code's station, replacing an earlier one, and use up the code.
+    """Make `key` the key of the station for which an enrolment code was made, and use up the code.
 
-    Raises: Conflict if the code is unknown, used or expired.
+    An earlier key of the station is withdrawn. `digest` is the digest of the code, `computer` the name of the computer
+    that sent it.
+
+    Raises:
+        Conflict: If the code is unknown, used or expired.
     """
     row = EnrolmentCode.objects.select_for_update().filter(digest=digest).first()
     if row is None or row.expires_at < timezone.now():

@@ -20,5 +20,5 @@ def holder_display_name(holder: str) -> str:
 
 
 def with_display_names(reason: str) -> str:
-    """Replace the holder names of pages in a message by user names."""
+    """Return a message in which each holder name of a page (web:USER:PAGE) is replaced by the user name."""
     return rewritten(reason, lambda text: _PAGE.sub(r"\1", text))

@@ -125,7 +125,10 @@ def _sentences(snapshot: Mapping[str, Any], redacted: Mapping[str, Any]) -> dict
 
 
 def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """Return id and arguments of an event, {} unless its whole text is shown and contains all arguments."""
+    """Return the id and arguments by which an event's text can be translated; {} if they may not be shown.
+
+    They are shown only if the user sees the event's whole text, and if this text contains all arguments.
+    """
     arguments = row.get("arguments") or {}
     if not row.get("id") or text != row.get("text") or not shows(text, arguments):
         return {}

@@ -60,13 +60,21 @@ class RequestCoalescer(Generic[T]):
         identity: Hashable,
         shared: bool = False,
     ) -> Future[T]:
-        """Start `work`, or join a pending request to the station with the same `key`; return the future of the answer.
+        """Send the request `work`, unless an equal one is pending; return the future of the station's answer.
 
-        If a request with this key is pending, `identity` decides. If it equals that of the pending request, this call
-        shares the pending request's answer. Otherwise one further request is sent when the pending one is over; all
-        calls that have arrived by then share that further request, and this call gets its answer. With `shared`, this
-        call gets the pending request's answer instead, and the further request is sent nevertheless.
-        Raises: TooManyRequests.
+        If no request to the station with this `key` is pending, `work` is started. If one is pending with the same
+        `identity`, this call shares the answer to that request. If one is pending with another `identity`, one further
+        request is sent as soon as the pending one is over. All calls that arrive until then share this further request.
+
+        Args:
+            station: Name of the station.
+            work: Function that sends the request and returns the answer.
+            key: Kind of request; only requests with equal keys share answers.
+            identity: Identity of this request; calls with an equal identity are repetitions of one request.
+            shared: Return the answer to the pending request in every case; the further request is sent too.
+
+        Raises:
+            TooManyRequests: If too many requests with other keys are pending at the station.
         """
         place, flight = (station, key), _PendingRequest(identity, work)
         flight.answer.set_running_or_notify_cancel()  # shared by callers: one must not cancel it for others

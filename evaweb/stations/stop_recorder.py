@@ -51,9 +51,10 @@ class StopRecorder:
         self._failed = LogThrottle(_EVERY_S, _MOST_NAMES, clock)
 
     def record(self, row: Command) -> None:
-        """Queue a stop. Repeats within a second with the same `merge_key` become the newest row with a count.
+        """Queue the row of a stop.
 
-        A press that latched the e-stop anew is not merged.
+        Rows that arrive within a second with the same `merge_key` are merged: only the newest is written, with the
+        number of presses. A press that latched the e-stop anew is not merged.
         """
         key = merge_key(row)
         with self._news:

@@ -87,10 +87,10 @@ def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> F
 
 
 def request_stop(command: messages.Command, station: str) -> Future[Answer]:
-    """Send a stop or halt and return the future of the answer.
+    """Send a stop or halt and return the future of the station's answer.
 
-    While a request of the same kind and lease is pending at the station, calls with another uuid do not share its
-    answer: they are combined into one more request, which is sent afterwards.
+    While a request of the same kind and lease is pending at the station, a call with the uuid of that request shares
+    the answer to it. All calls with other uuids are combined into one further request, which is sent afterwards.
     """
     key = (command.kind, command.holder, command.epoch)
     try:

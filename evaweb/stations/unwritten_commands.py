@@ -80,7 +80,10 @@ class UnwrittenCommands:
         self.start_writing()
 
     def start_writing(self) -> None:
-        """Wake the writer thread, starting it if needed; it also writes the commands that ended processes left."""
+        """Wake the writer thread; start the thread if it does not run yet.
+
+        The thread also writes the commands of processes that have ended.
+        """
         with self._starting:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="unwritten", daemon=True)

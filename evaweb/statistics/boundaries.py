@@ -242,7 +242,11 @@ def _boundary(
 
 
 def pair_counts(pairs: int, at: Sequence[int] | None = None) -> list[tuple[int, int]]:
-    """Return the looks of a paired design: after every pair, or after the pairs in `at` and the last."""
+    """Return the interim looks of a paired design as (trials of the first arm, trials of the second arm).
+
+    Both numbers are equal. There is a look after every pair or, if `at` is given, after each number of pairs in `at`
+    and after the last pair.
+    """
     chosen = range(1, pairs + 1) if at is None else sorted({*at, pairs})
     return [(pair, pair) for pair in chosen]
 
@@ -342,7 +346,11 @@ def _checked(counts: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 def _add_trials(
     alive: NDArray[np.float64], first: int, second: int, rates: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return the probabilities of tables after `first` and `second` more trials of each arm."""
+    """Return the probabilities of the tables after further trials.
+
+    `alive` are the probabilities of the tables before these trials. `first` and `second` are the numbers of further
+    trials of the two arms, and `rates` are the success rates of the arms.
+    """
     import numpy as np
 
     for axis, (more, rate) in enumerate(zip((first, second), rates, strict=True)):
@@ -363,9 +371,9 @@ def _least_extreme(
     spent: NDArray[np.float64],
     most: float,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-    """Return the least extreme table that may stop (None if no table may), and the error at each rate.
+    """Return the least extreme table at which the design may stop at this look, and the error at each rate.
 
-    The error includes the stop at this look.
+    The table is None if the design may not stop at any table. The error includes the stop at this look.
     """
     import numpy as np
 
@@ -438,7 +446,11 @@ def _least(
     trials: tuple[int, int],
     margin: float | None,
 ) -> tuple[int, int]:
-    """Return the least extreme table in `order`, decided exactly among those that equal the last one up to rounding."""
+    """Return the least extreme table in `order`, which is sorted from the most extreme table downwards.
+
+    The last tables may be equally extreme up to rounding. Of these, the least extreme is determined in exact
+    arithmetic.
+    """
     import numpy as np
 
     alike = order[levels[: len(order)] <= levels[len(order) - 1] * (1 + _TIE)]

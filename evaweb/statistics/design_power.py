@@ -110,8 +110,15 @@ class Outlook:
 def outlook(
     p_first: float, p_second: float, power: float, alpha: float, pairs: int, gains: tuple[float, ...]
 ) -> Outlook:
-    """Return the outlook of all designs at these rates with `pairs` pairs (0 to 250); `gains` are added to the first
-    rate.
+    """Return the comparison of all designs, if the arms have the rates `p_first` and `p_second`.
+
+    Args:
+        p_first: Success rate of the first arm.
+        p_second: Success rate of the second arm.
+        power: Wanted power, for the number of pairs that each design needs.
+        alpha: Alpha of each design.
+        pairs: Number of pairs that can be made (0 to 250).
+        gains: Further differences of the rates: each is added to `p_first`, and the sum replaces `p_second`.
     """
     needs = tuple(pairs_needed(rule, p_first, p_second, power, alpha) for rule in RULES)
     if not pairs:

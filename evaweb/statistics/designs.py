@@ -77,9 +77,9 @@ class Conclusion:
         blocks: Number of blocks made so far.
         ended_at_pair: Number of blocks after which the comparison ended; None while it continues.
         winner: Arm ("first" or "second") for which a boundary was crossed or the final test was significant.
-        p: Probability of the single test of a fixed number; None with any other rule.
+        p: p-value of the single test, if the design has a fixed number of trials; None with any other rule.
         foreseen: Number of blocks of the design.
-        dropped: Whether it ended because one of its arms was dropped.
+        dropped: Whether the comparison ended because one of its arms was dropped.
     """
 
     blocks: int
@@ -432,10 +432,10 @@ def _ahead(first: float, second: float) -> str:
 
 
 def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tuple[Design, list[Block]]:
-    """Return one comparison of a paired design as a design of its own at its share of alpha, and the blocks with both
-    arms.
+    """Return one comparison of a paired design as a design of its own, and the blocks with trials of both its arms.
 
-    This is used to check conclusions of a design that dropped arms: the later blocks of such a design lack some arms.
+    The new design has the comparison's share of alpha; `pair` are the indices of the arms. This is used to check
+    conclusions of a design that dropped arms: the later blocks of such a design lack some arms.
     """
     both = [block for block in blocks if {*pair} <= {arm for arm, _ in block}]
     return replace(found, alpha=found.share, comparisons=(pair,), drops=False), both

@@ -116,9 +116,10 @@ def summary(
     durations: Sequence[float],
     smoothness: Sequence[float] = (),
 ) -> Summary:
-    """Return the summary of the scored trials of one cell.
+    """Return the summary of scored trials that belong together, such as those of one checkpoint at one scene.
 
-    It has success, score (0 to 1), duration [s] and SPARC, as far as they are known.
+    The summary has the success rate, mean score (0 to 1), median duration [s] and mean smoothness (SPARC). A value is
+    None if it is known of no trial.
     """
     return Summary(
         proportion(sum(map(bool, outcomes)), len(outcomes)),

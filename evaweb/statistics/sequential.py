@@ -22,9 +22,14 @@ BET_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)  # share of its wealth that each gambl
 class Evidence:
     """Evidence of a sequence of pairs for both directions, after each pair.
 
-    `first` and `second` [pairs] are log e-values that the first, or the second, arm is better; `p_first` and
-    `p_second` [pairs] are the anytime-valid probabilities, the running minimum of 1/e. `stop` is the number of pairs
-    after which one of them was first at most alpha/2, None if neither was; `winner` is that arm ("first" or "second").
+    Attributes:
+        first: Log e-value that the first arm is better [pairs].
+        second: Log e-value that the second arm is better [pairs].
+        p_first: Anytime-valid probability of the first direction, the running minimum of 1/e [pairs].
+        p_second: Anytime-valid probability of the second direction [pairs].
+        alpha: Two-sided alpha; each direction has half of it.
+        stop: Number of pairs after which `p_first` or `p_second` first was at most alpha/2; None if neither was.
+        winner: Arm ("first" or "second") of the direction that reached alpha/2; None if neither did.
     """
 
     first: tuple[float, ...]

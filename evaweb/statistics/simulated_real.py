@@ -46,8 +46,9 @@ def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float
 def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
     """Return the mean rank violation over the checkpoints.
 
-    The violation of a checkpoint is the largest difference of real values between it and any checkpoint with which it
-    has another order in simulation; 0 without such a checkpoint.
+    Two checkpoints violate the ranking if their order in simulation is not their order in reality. The violation of a
+    checkpoint is the largest difference of real values between this checkpoint and any with which it violates the
+    ranking; 0 if there is no such checkpoint.
     """
     _check(simulated, real)
     numbers = range(len(real))

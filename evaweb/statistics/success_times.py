@@ -20,9 +20,10 @@ Times = Sequence[float | None]  # time to success of each trial [s]; None: it fa
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Share of successes by time: from `times[i]` [s] on it is `share[i]`, with its pointwise Wilson interval.
+    """Share of the trials that have succeeded by a time.
 
-    The share is 0 before the first time. The last time is at most `until` [s], the horizon of all `n` trials.
+    The share is 0 before the first time. It is `share[i]` from `times[i]` [s] until the next time, and `low[i]` to
+    `high[i]` is the pointwise Wilson interval. The last time is at most `until` [s], the horizon of all `n` trials.
     """
 
     times: tuple[float, ...]

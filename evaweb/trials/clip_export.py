@@ -47,7 +47,10 @@ def clip_archive(filters: FailureFilters, sight: Visibility, root: str) -> Itera
 
 
 def _clip(trial: Trial) -> tuple[bytes, dict[str, Any]]:
-    """Return the clip as a video (b"" if there is none) and its columns of the table."""
+    """Return the trial's clip as a video, and the values that describe the clip in the table of the archive.
+
+    The video is b"" if there is none; the values then say why.
+    """
     values = dict.fromkeys(("file", "why_no_file"), "") | {"file_begin_s": None}
     clip, episode = clip_of(trial), trial.episode
     if clip is None or episode is None:

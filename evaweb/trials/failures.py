@@ -75,7 +75,10 @@ def score_failure(score: Score | None) -> dict[str, str]:
 
 
 def ordered_terms() -> Mapping[str, tuple[str, ...]]:
-    """Return by field the terms of each level, including retired ones, in the lab's order."""
+    """Return the terms of each level of failures, including retired terms, in the lab's order.
+
+    The keys are the names that the levels have in scores, forms and REST.
+    """
     rows = FailureTerm.objects.values_list("level", "words")
     return {field: tuple(text for of, text in rows if of == level) for field, level in FIELDS.items()}
 

@@ -253,7 +253,11 @@ class Checkpoint(models.Model):
 
 
 class Evaluation(models.Model):
-    """Set of trials: those of a plan or, for the open bench of a station, its trials outside any plan."""
+    """Set of trials.
+
+    The set belongs to a plan or to the open bench of a station. The latter consists of the station's trials outside any
+    plan.
+    """
 
     class Kind(models.TextChoices):
         OPEN_BENCH = "open_bench", "open bench"

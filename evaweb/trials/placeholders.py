@@ -1,4 +1,8 @@
-"""Placeholders for rows that restored trials need: found by name, or created deactivated and marked."""
+"""Rows that restored trials refer to, such as their scene and checkpoint.
+
+A row is found by its name. If there is none, a placeholder is created. Scenes and checkpoints that are created here are
+deactivated and marked as placeholders.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +16,17 @@ PLACEHOLDER_NOTE = "Known from recordings alone: the database was lost."
 
 
 def station(facts: TrialRecord) -> Station:
-    """Return the trial's station."""
+    """Return the trial's station, found by name; create it if it does not exist."""
     return get_or_create_station(
         name=facts.station, robot="", simulated=facts.simulated, source=f"trial {facts.uuid}"
     )
 
 
 def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
-    """Return the trial's evaluation.
+    """Return the evaluation of a recorded trial; create it if it does not exist.
 
-    A station's open bench is one row with a version number; the number is raised to that of the trial if it is lower.
+    Trials outside of a plan belong to the station's open bench, which is one row with a version number. If the version
+    number of this row is lower than that of the trial, it is raised to that of the trial.
     """
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         row, _ = Evaluation.objects.get_or_create(
@@ -61,7 +66,7 @@ def scene(facts: TrialRecord) -> Scene:
 
 
 def position(scene: Scene, number: int) -> Position:
-    """Return the scene's position of that number."""
+    """Return the scene's position of that number; create it if it does not exist."""
     note = f"{PLACEHOLDER_NOTE} Write down again where things stand."
     row, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": note})
     return row

@@ -139,7 +139,7 @@ class TrialRecord(Line):
 
     @classmethod
     def names(cls) -> Iterable[str]:
-        """Return the names of the written columns."""
+        """Return the names of the columns that are written to disk."""
         return [name for name, column in COLUMNS.items() if column.written != "never"]
 
     @classmethod

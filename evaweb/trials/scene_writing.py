@@ -280,7 +280,7 @@ def _twice(tables: Sequence[PositionTable]) -> list[Fault]:
 
 
 def _pictured(row: Position) -> str:
-    """Return "reference pictures", a reason to keep the position, if it has any; else ""."""
+    """Return the reason to keep a position that has reference pictures; "" if the position has none."""
     return "reference pictures" if row.references.exists() else ""  # type: ignore[attr-defined]
 
 

@@ -281,7 +281,7 @@ _MOST_CHANGED = 2000  # number of changes beyond which all cells are recomputed
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """Cached cells, and the changes of trials that they include."""
+    """Cached summaries by cell, and the newest changes of trials that these summaries already include."""
 
     cells: dict[_Cell, Summary]
     newest: datetime | None

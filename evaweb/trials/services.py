@@ -449,8 +449,9 @@ def lock_trial(trial: Trial) -> Trial:
 
 
 def _reject_repeat(trial: Trial, values: Mapping[str, Any], outcome: ScoredOutcome) -> None:
-    """Raise Conflict if this equals an earlier score of the rater: it may be a late copy of a score that was
-    corrected.
+    """Raise Conflict if the new score equals an earlier score of the same rater.
+
+    Such a score may be a late copy of a request whose score has been corrected since.
     """
     before = trial.scores.filter(rater=values["rater"]).prefetch_related("outcomes")
     if any(_is_same_score(score, values, outcome) for score in before):

@@ -239,10 +239,13 @@ def _require_set_up(trial: Trial) -> None:
 
 
 def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
-    """Raise Conflict unless the station has the trial's checkpoint loaded, whichever client set it up last.
+    """Raise Conflict unless the station has the trial's checkpoint loaded.
 
-    If the set-up changes after this check, the run is stale, and the station refuses to run it.
-    Returns: Durations of the policy's set-up stages [s], None if unknown.
+    It does not matter which client set the station up last. If the set-up changes after this check, the run is stale,
+    and the station refuses to run it.
+
+    Returns:
+        Durations of the policy's set-up stages [s], None if unknown.
     """
     status = connection_to(trial.station.name).status()
     loaded = status.get("checkpoint") or {}

@@ -93,7 +93,10 @@ def _episode(trial: Trial, uuid: UUID) -> Episode:
 
 
 def _find_trial_of(station: Station, episode: UUID | None) -> None:
-    """Assign an episode to its trial if the answer that named it was lost, by querying the runtime again."""
+    """Assign a recorded episode to its trial if the station's answer to the run command was lost.
+
+    The lost answer named the episode; the runtime is therefore queried again.
+    """
     if episode is None or Trial.objects.filter(episode_id=episode).exists():
         return
     trial = Trial.objects.filter(station=station, episode=None, run__isnull=False).order_by("-pk").first()
@@ -187,7 +190,11 @@ def _runtime_restarted(trial: Trial) -> Trial:
 
 
 def _apply_transition(trial: Trial, move: Transition, reason: str, time: float | None) -> None:
-    """Apply a transition and add the running time; the clock stops during a pause. `time` [s] may be None."""
+    """Apply a transition to the trial, and add the time since the run began or was resumed to the trial's duration.
+
+    The duration does not grow during a pause. `time` is the time of the event on the run's clock [s]; if it is None,
+    nothing is added.
+    """
     if trial.run_since is not None and time is not None:
         trial.duration_s = (trial.duration_s or 0.0) + max(0.0, time - trial.run_since)
     lifecycle.apply(trial, move)

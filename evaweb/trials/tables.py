@@ -130,9 +130,9 @@ def _is_number(value: object) -> bool:
 
 
 def _problems(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
-    """Return the errors of `value` as a table of the kind that `config` models.
+    """Return the errors of the table `value`; `config` is the model class of this kind of table.
 
-    Missing keys are no errors: they come from the deployment.
+    Missing keys are no errors, because the deployment supplies their values.
     """
     kind = config.model_fields["kind"].default
     try:

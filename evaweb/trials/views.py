@@ -175,7 +175,10 @@ def bench_images(trial: Trial) -> list[Any]:
 
 
 def _is_checked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
-    """Return True if the milestone's box is ticked: as typed, else as last scored."""
+    """Return True if the milestone's box is ticked on the score form.
+
+    The box is as the user `typed` it in a refused form; without such a form, it is as in the newest score.
+    """
     if typed and "milestones" in typed:
         return bool(typed["milestones"].get(milestone))
     outcomes = trial.scores.all()[0].outcomes.all() if trial.verdict_id else ()

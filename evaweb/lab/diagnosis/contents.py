@@ -79,7 +79,11 @@ def machine() -> list[dict[str, Any]]:
 
 
 def lab_settings() -> dict[str, Any]:
-    """Return settings from the allow list, and the names of other variables that are set."""
+    """Return the settings of the lab that a diagnostic bundle may contain.
+
+    Of the environment variables, only those on the allow list are given with their values; of the lab's other variables
+    that are set, only the names are given.
+    """
     names = sorted(
         name for name in os.environ if name.startswith("EVA_") or name in ("DATABASE_URL", "REDIS_URL")
     )

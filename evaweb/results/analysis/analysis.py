@@ -166,7 +166,11 @@ _FEWEST_RUNS = 3  # runs of a recipe for an interval
 
 
 def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) -> Iterator[Recipe]:
-    """Yield each recipe of which at least two training runs have trials."""
+    """Yield the success rates of each training recipe of which at least two checkpoints have trials.
+
+    `arms` are the trials by checkpoint, `recipes` the recipes by checkpoint; each checkpoint is one training run of its
+    recipe.
+    """
     runs: dict[str, dict[str, float]] = defaultdict(dict)
     for name in sorted(arms):
         if recipes.get(name):

@@ -404,7 +404,10 @@ _OF_DESIGN = {"success": "evidence", "score": "score_evidence"}  # statistic tha
 
 
 def compare(names: tuple[str, str], trials: ComparedTrials, verdict: Verdict | None) -> Comparison:
-    """Return the comparison of two checkpoints; it is a planned one if its design has a `verdict` on it."""
+    """Return the comparison of the two checkpoints called `names`.
+
+    `verdict` is what the plan's design says about the comparison; None if the comparison was not planned.
+    """
     notes = _later(len(trials.pairs) - len(trials.evidence))
     statistics = compute_all(Comparison, trials, notes)
     notes += _unpaired(trials) if trials.in_pairs else [_RANDOM]

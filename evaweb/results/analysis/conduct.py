@@ -475,10 +475,12 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
 
 
 def _bench(plan: Plan, runs: Iterable[AttemptRecord], images: Iterable[BenchImage]) -> dict[str, Any]:
-    """Return the plan's match gate, and the runs that did not demonstrably pass it.
+    """Return the plan's match gate, and the runs that did not demonstrably pass the gate.
 
-    Of the result's keys, `low` has the runs with a match below the gate, `unmatched` the codes of runs without a known
-    match, and `references` the cameras whose reference image was replaced during the plan.
+    The match gate is the least match of a camera's picture with its reference picture; None if the plan has none. In
+    the result, key `gate` is the gate. Key `low` lists the runs with a match below the gate. Key `unmatched` lists the
+    codes of runs without a known match. Key `references` lists the cameras whose reference image was replaced during
+    the plan.
     """
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []
@@ -586,8 +588,9 @@ def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
 
 
 def _idle_gaps(runs: Iterable[AttemptRecord]) -> dict[int, float]:
-    """Return by attempt number the time between the end of the previous attempt at the same station and its
-    start [s].
+    """Return for each attempt how long its station was idle before it [s], by attempt number.
+
+    This is the time from the end of the previous attempt at the same station to the start of the attempt.
     """
     ended: dict[str, datetime] = {}
     gaps = {}

@@ -43,7 +43,7 @@ def parse_filter(given: Mapping[str, str], runs: Iterable[Outcome]) -> TrialFilt
     """Return the filter that the query of an address (`given`) describes.
 
     Raises:
-        EvaError: If it names a value that the trials do not have.
+        EvaError: If the query names a value that the trials do not have.
     """
     trial_filter = TrialFilter(
         **{name: given.get(name, "").strip() for name in ("scene", "position", "station", "operator")}

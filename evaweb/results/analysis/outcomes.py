@@ -43,7 +43,7 @@ class Outcome:
 
     @property
     def condition(self) -> str:
-        """Initial condition without its repetition."""
+        """Initial condition as SCENE/POSITION; all repetitions of it have the same text."""
         return f"{self.scene}/{self.position}"
 
 
@@ -93,7 +93,10 @@ def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[P
 
 
 def unbroken(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return the pairs of a whole plan, in order, up to its first incomplete block."""
+    """Return the pairs before the first incomplete block.
+
+    `pairs` are all pairs of a plan, in the order of its blocks.
+    """
     return [pair for place, pair in enumerate(pairs) if _place(pair) == place]
 
 

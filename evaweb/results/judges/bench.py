@@ -16,7 +16,7 @@ class BenchTruth:
     version = "bench 1"
 
     def prompt_text(self, case: TrialCase) -> str:
-        """Return "": it has no prompt."""
+        """Return "", because this judge has no prompt."""
         return ""
 
     def judge(self, case: TrialCase) -> CaseJudgement:

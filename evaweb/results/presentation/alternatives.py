@@ -150,7 +150,11 @@ def _concluded(conclusions: Iterable[Conclusion]) -> list[tuple[str | None, bool
 def _of_these(
     original: Design, pair: tuple[int, int], left: Sequence[int], base: Sequence[Block]
 ) -> tuple[Design, list[Block]]:
-    """Return the design of one comparison as if planned for only the blocks at the indices `left`, and these blocks."""
+    """Return one comparison's design, reduced to the blocks at the indices `left`, and these blocks.
+
+    The design is the one that would result if only these blocks had been planned. `pair` are the indices of the
+    comparison's arms, and `base` are all blocks.
+    """
     blocks = [base[at] for at in left]
     if original.counts is None:
         single, both = alone(original, pair, blocks)

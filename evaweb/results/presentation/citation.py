@@ -176,7 +176,7 @@ class Citation:
 
     @property
     def lines(self) -> list[str]:
-        """Sentence, setting, design, reasons for doubt, source."""
+        """Lines of the citation: sentence, setting, design, reasons for doubt and source, as far as there are any."""
         return [
             line for line in (self.sentence, self.setting, self.design, *self.doubts, self.source) if line
         ]

@@ -35,7 +35,7 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
     """Return the comparison as one sentence that states only the result of the corrected exact test.
 
     Raises:
-        ValueError: If the comparison is planned and still open: its design decides.
+        ValueError: If the comparison is planned and still open: its design decides, and has not ended.
     """
     if found.corrected is None:
         raise ValueError(f"{found.first} and {found.second}: their design decides, which has not ended")

@@ -110,7 +110,8 @@ class Headline:
 def conclude(plan: Plan, found: Design, now: Tried, decided: Sequence[Block]) -> Headline:
     """Return the headline of a plan: the conclusion of its design `found` from the blocks `decided`.
 
-    `decided` are the blocks that count; `now` are the current outcomes, from which the alternatives are made.
+    `decided` are the blocks that count. `now` are the current outcomes, from which the alternative headlines and the
+    worst cases are made.
     """
     return Headline(
         sentences_of(plan, found, decided),
@@ -286,8 +287,9 @@ def _other(plan: Plan, design: Design, blocks: Sequence[Block], decided: Sequenc
 
 
 def _estimates(plan: Plan, design: Design, blocks: Sequence[Block]) -> Iterator[str]:
-    """Yield the corrected estimate of each comparison that stopped at a boundary: its raw difference is too
-    large on average.
+    """Yield the corrected estimate of each comparison that stopped at a boundary.
+
+    The raw difference of such a comparison is too large on average.
     """
     rows = zip(compared(plan.document or {}), design.comparisons, findings(design, blocks).each, strict=True)
     for (first, second), pair, conclusion in rows:
@@ -309,9 +311,10 @@ def _estimates(plan: Plan, design: Design, blocks: Sequence[Block]) -> Iterator[
 
 @dataclass(frozen=True, slots=True)
 class WorstCase:
-    """Conclusion of a comparison with discarded, unscored attempts counted against its winner.
+    """Conclusion of a comparison in the worst case for its winner.
 
-    `same` is True if the winner still wins.
+    In this case, attempts that were discarded without a score count against the winner. `same` is True if the winner
+    still wins.
     """
 
     sentence: str
@@ -341,9 +344,9 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
 
 
 def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
-    """Return `now` with the outcomes in `decided` as those that count.
+    """Return `now` with the blocks `decided` in place of its counted blocks.
 
-    It is returned unchanged if `decided` is not from the same trials.
+    `now` is returned unchanged if `decided` is not from the same trials.
     """
     if len(now.counted) != len(decided):
         return now
@@ -365,7 +368,10 @@ def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
 def conclude_alone(
     plan: Plan, single: Design, number: int, blocks: Sequence[Block]
 ) -> tuple[str, Conclusion]:
-    """Return sentence and conclusion of comparison `number` from these blocks by the design `single`."""
+    """Return the sentence and the conclusion of comparison `number` of the plan.
+
+    The conclusion is drawn from `blocks` by the design `single`.
+    """
     names = compared(plan.document or {})[number]
     pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
     conclusion = evaluate_design(single, blocks, pair)

@@ -32,10 +32,12 @@ class PlanResult:
     only: TrialFilter = field(default_factory=TrialFilter)
 
     def select(self, given: Mapping[str, str]) -> PlanResult:
-        """Return the result of the trials that an address selects.
+        """Return the result of those trials that the filters in an address select.
+
+        `given` is the query of the address.
 
         Raises:
-            EvaError: If it names a value that the trials do not have.
+            EvaError: If a filter names a value that the trials do not have.
         """
         chosen = replace(self, only=parse_filter(given, self.runs.outcomes))
         vars(chosen).update(at=self.at, runs=self.runs)  # do not depend on the selection

@@ -102,9 +102,10 @@ def judges_ready() -> list[AutomaticJudge]:
 
 
 def request_judging(*, user: User, plan: Plan, name: str) -> Job:
-    """Enqueue a job that shows all scored trials of the plan to a judge; for its owner or an administrator.
+    """Enqueue a job that shows all scored trials of the plan to the judge called `name`.
 
-    Allowed before the reveal too: judgements are hidden until then.
+    Only the plan's owner and administrators may request this. They may do so before the reveal too, because judgements
+    are hidden until then.
     """
     role = require_role(user, Role.OPERATOR)
     if role is not Role.ADMIN and plan.owner_id != user.pk:

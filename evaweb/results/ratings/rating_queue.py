@@ -230,7 +230,10 @@ def save_rating(
 
 
 def next_to_compare(user: User, plans: Iterable[Plan] | None = None) -> NextItem[Pair]:
-    """Return the next pair with images that this user has not compared."""
+    """Return the next pair of trials that this user has not compared yet and whose images are on this machine.
+
+    If there is no such pair, the next pair whose images may still arrive is returned.
+    """
     fresh: list[tuple[Plan, list[tuple[int, int]]]] = []
     for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
         if not has_looked_at_the_same(plan, user):

@@ -1,4 +1,7 @@
-"""Bench layouts of a plan's trials for its report: each camera's image, and the reference at that time."""
+"""Images of the bench before each trial of a plan, for the plan's report.
+
+For each trial and camera, the report contains the image and the reference with which the image was compared then.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ _FIELDS = (
 
 
 def layout_rows(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    """Yield rows, one for each camera of each attempt."""
+    """Yield pages of rows; there is one row for each camera of each attempt."""
     rows = Achieved.objects.filter(trial__evaluation=plan.evaluation_id).order_by("trial_id", "pk")
     yield [dict(zip(COLUMNS, row, strict=True)) for row in rows.values_list(*_FIELDS)]
 

@@ -1,4 +1,7 @@
-"""Record of a reveal in addition to the blocks that count, so that reports show later changes."""
+"""Facts that are recorded at a plan's reveal, so that its reports show later changes.
+
+They are recorded in addition to the blocks that count.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +45,11 @@ def record_to_seal(plan: Plan) -> dict[str, Any]:
 
 
 def _measured(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a dict with a digest of the measurements of all runs (key "digest") and their names (key "names").
+    """Return a dict that identifies the measurements of all runs.
 
-    Key "later" lists the trials whose recordings have not been analysed yet: of these trials, the digest covers only
-    the measurements that need no recording.
+    Key "digest" is a digest of the values. Key "names" lists the names of the measurements. Key "later" lists the
+    trials whose recordings have not been analysed yet: of these trials, the digest covers only the measurements that
+    need no recording.
     """
     later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
     values = [

@@ -1,4 +1,7 @@
-"""`manage.py lab [DEPLOYMENT...]`: web, worker and the stations of this machine; all end with it."""
+"""`manage.py lab [DEPLOYMENT...]`: run web, worker and the stations of this machine.
+
+All these processes end when the command ends.
+"""
 
 from __future__ import annotations
 

@@ -332,11 +332,12 @@ def share_of(plan: Mapping[str, Any]) -> float:
 
 
 def _bound(share: Sequence[float], alpha: float) -> float:
-    """Return an upper bound of the mean of `share` over binomial numbers of successes, valid at any rate.
+    """Return an upper bound of the mean of `share`, valid at any success rate.
 
-    Rate and mean are both expressed as sin(angle)^2. The mean's angle then changes by at most sqrt(trials) per radian
-    of the rate's angle, which bounds it between grid points. An interval whose bound exceeds alpha is bisected, down to
-    the numerical resolution.
+    The mean is over the binomial number of successes, which is the index of `share`. Rate and mean are both expressed
+    as sin(angle)^2. The mean's angle then changes by at most sqrt(trials) per radian of the rate's angle. This limits
+    the mean between the points of a grid of rates. An interval whose bound exceeds alpha is bisected, down to the
+    numerical resolution.
     """
     turn, allowed, end = math.sqrt(len(share) - 1), math.asin(math.sqrt(alpha)), 1e-7
 

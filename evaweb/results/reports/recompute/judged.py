@@ -88,7 +88,11 @@ def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def preferences(rows: Sequence[tuple[str, str, str, float]]) -> dict[str, Any] | None:
-    """Return the ranking of (first, second, outcome, weight); null if the likelihood has no maximum."""
+    """Return the ranking of the checkpoints by preferences, with the number of preferences and of ties.
+
+    Each row is one preference: (first checkpoint, second checkpoint, outcome, weight). If the likelihood has no
+    maximum, key "ranking" is None. The result is None if no row compares two different checkpoints.
+    """
     rows = [row for row in rows if row[0] != row[1]]
     if not rows:
         return None

@@ -29,7 +29,10 @@ def student_t(freedom: int) -> float:
 
 
 def _within(angle: float, freedom: int) -> float:
-    """Return the probability of t between -x and x, for x = tan(angle) sqrt(freedom)."""
+    """Return the probability that a variable with Student's t distribution is between -x and x.
+
+    Here x = tan(angle) sqrt(freedom), and `freedom` is the number of degrees of freedom.
+    """
     cosine, sine = math.cos(angle), math.sin(angle)
     term, total = (1.0, 0.0) if freedom % 2 == 0 else (cosine, 0.0)
     for k in range(freedom // 2):
@@ -167,7 +170,11 @@ def _highest(function: Callable[[float], float], low: float, high: float, parts:
 
 
 def better(x1: int, n1: int, x2: int, n2: int) -> float:
-    """Return the probability that the first rate is higher, with uniform priors: Beta(a, b) above Beta(c, d)."""
+    """Return the probability that the first rate is higher than the second, with uniform priors.
+
+    `x1` of `n1` and `x2` of `n2` trials succeeded. The rates are distributed as Beta(a, b) and Beta(c, d), with a = x1
+    + 1, b = n1 - x1 + 1, c = x2 + 1, d = n2 - x2 + 1.
+    """
     a, b, c, d = x1 + 1, n1 - x1 + 1, x2 + 1, n2 - x2 + 1
 
     def log_beta(p: float, q: float) -> float:
@@ -268,8 +275,10 @@ def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
 
 
 def _hypergeometric(n1: int, n2: int, successes: int) -> tuple[int, list[float]]:
-    """Return the smallest number of the first arm's successes with these margins, and the probabilities from
-    there on.
+    """Return the probabilities of the first arm's numbers of successes, given `successes` of both arms together.
+
+    The arms have `n1` and `n2` trials. The first return value is the smallest possible number of successes of the first
+    arm. The second is the probability of this number and of each larger possible one.
     """
     least, most = max(0, successes - n2), min(n1, successes)
     whole = math.comb(n1 + n2, successes)
@@ -329,10 +338,10 @@ def score_bets(differences: Sequence[float]) -> list[float]:
 
 
 def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
-    """Return the interval of means that no bet has refuted after any pair, or None if it is empty.
+    """Return the interval of those mean differences that the bets have not refuted; None if the interval is empty.
 
-    The bets are those of `score_bets`. They are placed on the differences rescaled so that -1 stays -1 and the tested
-    mean becomes 0.
+    A mean is refuted if a bet against it has won enough after any pair. The bets are those of `score_bets`. For each
+    tested mean, the differences are rescaled first, such that the tested mean becomes 0 and -1 remains -1.
     """
 
     def refuted(values: Sequence[float]) -> float:
@@ -347,11 +356,10 @@ def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
 
 
 def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
-    """Return the two-sided probability of a sum of differences as large as the observed one if each sign is equally
-    likely.
+    """Return the two-sided probability of a sum of differences as large as the observed one.
 
-    The probability is computed in integers: the coefficients of the product of all (1 + x^d), packed into one long
-    number.
+    The probability holds if each difference is equally likely to have either sign. It is computed in integers, from the
+    coefficients of the product of all (1 + x^d); all coefficients are packed into one long number.
     """
     units: list[int] = []
     for parts in (25_200, 2_520, 420, 60, 12):

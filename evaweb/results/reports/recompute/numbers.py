@@ -161,7 +161,8 @@ def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, A
 def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:
     """Remove all tests and evidence from an open comparison, so that only descriptions remain.
 
-    If the design is a test by e-values (`stopping`), the evidence on its outcome remains too.
+    `stopping` is the plan's design. If it is a test by e-values, the evidence on the outcome that the design tests
+    remains too.
     """
     own = {"success": "evidence", "score": "score_evidence"}[stopping.get("outcome") or "success"]
     for name in (

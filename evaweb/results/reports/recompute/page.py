@@ -238,9 +238,10 @@ def below(root: Node, *head: str) -> list[list[str]]:
 
 
 def cells_fit(given: Sequence[str], wanted: Sequence[str], later: bool) -> bool:
-    """Return True if each cell has the wanted text.
+    """Return True if each cell of a row has the wanted text.
 
-    If scores came `later`, a text on later corrections may follow the rate in the first cell.
+    The first cell is a rate. If `later` is True, because scores were added after the reveal, a text about later
+    corrections may follow the rate.
     """
     rate, *further = given or [""]
     return list(further) == list(wanted[1:]) and (
