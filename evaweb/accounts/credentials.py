@@ -69,7 +69,10 @@ class LookupOverload(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Login:
-    """User as the database last reported them; `checked` is on this process's monotonic clock [s]."""
+    """User as the database last reported them.
+
+    `checked` is the time of that report [s] on the monotonic clock of this process.
+    """
 
     pk: int
     username: str
@@ -326,7 +329,12 @@ def remaining_wait(came: float, answered: float, now: float) -> float:
 
 
 async def _first_known(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
-    """Return the first known user. Raises: Unverifiable at once; LookupOverload if no lookup finds a user."""
+    """Return the first user that one of the lookups finds; None if all lookups end without a user.
+
+    Raises:
+        Unverifiable: As soon as a lookup ends with this error before a user is found.
+        LookupOverload: After all lookups, if none found a user and one was refused because of overload.
+    """
     busy: LookupOverload | None = None
     for completed in asyncio.as_completed(asking):
         answer = await completed

@@ -179,7 +179,7 @@ class CamerasOut(Schema):
 
     @staticmethod
     def of(check: CameraCheck | None) -> dict[str, Any]:
-        """Return the confirmation."""
+        """Return the camera check as a dict; if `check` is None, nothing is confirmed."""
         views = check.seen if check else {}
         rows = [{"camera": camera, **facts} for camera, facts in views.items()]
         return {"confirmed": check is not None, "at": check.at if check else None, "cameras": rows}

@@ -41,7 +41,7 @@ class StatisticsOut(Schema):
 
     @staticmethod
     def of(row: StatisticsRow) -> dict[str, Any]:
-        """Return the row flat, the same for JSON and CSV."""
+        """Return the row as a dict without nested values, the same for JSON and CSV."""
         success, interval = row.summary.success, row.summary.success.interval
         smooth = row.summary.smoothness
         spread = smooth.interval if smooth else None

@@ -56,9 +56,10 @@ def restore(kept: RestorableRun) -> int:
 
 
 def _session(uuid: UUID, episode: Episode, run: RestorableRun) -> CollectSession:
-    """Restore a session from its file, else from the manifest of its first episode found.
+    """Restore a session from its own file or, if that file has no opening event, from a manifest.
 
-    A manifest has neither target nor history.
+    The manifest is that of `episode`, the first episode of the session that was found. A manifest contains neither the
+    session's target nor its history.
     """
     events = SESSIONS.read(uuid, run.report_problem)
     first = next((event for event in events if event.kind == "opened"), None)

@@ -56,7 +56,10 @@ class RecentSamples:
     def add_sample(
         self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
     ) -> EncodedPart:
-        """Add the sample measured at `now`, and return the part of the stream with it."""
+        """Add the sample measured at `now`, and return the encoded part of the stream with all recent samples.
+
+        `vectors` and `words` are the numeric and the other values of the sample, by name.
+        """
         sample = _sample(vectors, words, now)
         if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
             self._samples.clear()  # another robot

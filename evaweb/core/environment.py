@@ -44,7 +44,7 @@ class Bucket:
 
 
 def read_flag(name: str, default: bool) -> bool:
-    """Return a boolean setting."""
+    """Return the boolean value of the environment variable `name`."""
     text = os.environ.get(name)
     if text is None:
         return default
@@ -55,7 +55,7 @@ def read_flag(name: str, default: bool) -> bool:
 
 
 def read_list(name: str, default: tuple[str, ...] = ()) -> list[str]:
-    """Return the items of a comma-separated setting."""
+    """Return the items of the environment variable `name`, which are separated by commas."""
     text = os.environ.get(name)
     return list(default) if text is None else [word.strip() for word in text.split(",") if word.strip()]
 
@@ -74,22 +74,22 @@ def _number(name: str, default: float, least: float, most: float, allowed: str) 
 
 
 def read_seconds(name: str, default: float) -> float:
-    """Return a duration above zero [s]."""
+    """Return the duration [s] in the environment variable `name`, which must be above zero."""
     return _number(name, default, sys.float_info.min, sys.float_info.max, "seconds above zero")
 
 
 def mebibytes(name: str, default: float) -> float:
-    """Return a size of at least 1 [MiB]."""
+    """Return the size [MiB] in the environment variable `name`, which must be at least 1."""
     return _number(name, default, 1.0, 1e6, "mebibytes from 1 to 1000000")
 
 
 def gigabytes(name: str, default: float) -> float:
-    """Return a size of at least 0 [GB]."""
+    """Return the size [GB] in the environment variable `name`, which must be at least 0."""
     return _number(name, default, 0.0, 1e6, "gigabytes from 0 to 1000000")
 
 
 def niceness(name: str, default: int) -> int:
-    """Return a process niceness from 0 (normal priority) to 19 (lowest)."""
+    """Return the process niceness in the environment variable `name`: from 0 (normal priority) to 19 (lowest)."""
     text = os.environ.get(name)
     if text is None:
         return default
@@ -99,7 +99,7 @@ def niceness(name: str, default: int) -> int:
 
 
 def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
-    """Return the addresses and networks of a comma-separated setting; [] if it is not set."""
+    """Return the comma-separated addresses and networks in the environment variable `name`; [] if it is not set."""
     try:
         return [ip_network(word) for word in read_list(name)]
     except ValueError as error:
@@ -110,7 +110,7 @@ def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
 
 
 def address(name: str) -> tuple[str, int] | None:
-    """Return host and port of a setting HOST:PORT; None if it is not set."""
+    """Return host and port in the environment variable `name` (HOST:PORT); None if it is not set."""
     text = os.environ.get(name, "").strip()
     if not text:
         return None
@@ -123,7 +123,7 @@ def address(name: str) -> tuple[str, int] | None:
 
 
 def log_level(name: str, default: str) -> str:
-    """Return the name of the lowest logged level."""
+    """Return the level in the environment variable `name`: messages below it are not logged."""
     level = os.environ.get(name) or default
     if level not in _LEVELS:
         raise ImproperlyConfigured(f"{name} = {level!r}; allowed: {', '.join(_LEVELS)}")
@@ -131,7 +131,7 @@ def log_level(name: str, default: str) -> str:
 
 
 def time_zone(name: str, default: str) -> str:
-    """Return the name of the time zone in which pages show times."""
+    """Return the time zone in the environment variable `name`, in which pages show times."""
     zone = os.environ.get(name)
     if not zone:
         return default

@@ -43,7 +43,10 @@ _hurry: ContextVar[float | None] = ContextVar("hurry", default=None)
 
 @contextmanager
 def short_lock_wait(seconds: float = HURRY_S) -> Iterator[None]:
-    """Limit lock waits, and statements on PostgreSQL, of connections opened in this context to `seconds` [s]."""
+    """Limit how long database connections opened in this context wait for a lock to `seconds`.
+
+    On PostgreSQL the duration of each statement is limited too.
+    """
     token = _hurry.set(seconds)
     try:
         yield

@@ -104,12 +104,12 @@ class ReplayOffer:
 
     @property
     def sent(self) -> str:
-        """Description of the values that are sent."""
+        """Description of the values that the replay sends to the station."""
         return SPACES[self.space]
 
     @property
     def names(self) -> Sequence[str]:
-        """Names of the values that are sent."""
+        """Names of the joints or pose values that the replay sends to the station."""
         return self.recorded.joints if self.space == "joint" else self.recorded.poses
 
     @property

@@ -67,7 +67,10 @@ def _strategies(heads: Any) -> tuple[list[str], Array]:
 
 
 def _planned(raw: Any, numbers: Array) -> tuple[Array, Array]:
-    """Return for each chunk the first and the last of its rows that have a planned step."""
+    """Return the first and the last row of each chunk that were planned for a step; -1 if no row was.
+
+    `raw` is the table of the rows of all chunks, and `numbers` are the ids of the chunks in ascending order.
+    """
     used = raw.filter(np.asarray(raw.column("target_step").to_numpy() >= 0))
     places = np.searchsorted(numbers, used.column("chunk_id").to_numpy())
     index = used.column("index").to_numpy()

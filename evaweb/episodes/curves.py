@@ -140,7 +140,7 @@ def vectors(table: Any, name: str, width: int) -> Array:
 
 
 def _requested_rows(episode: Episode) -> tuple[Array, Array]:
-    """Return for each row of the smoothed stream its tick, and whether that was recorded."""
+    """Return the index of the tick of each row of the smoothed stream, and whether that tick was recorded."""
     steps = episode.ticks.column("step").to_numpy()
     requested = episode.smoothed.column("step").to_numpy()
     places = np.searchsorted(steps, requested)

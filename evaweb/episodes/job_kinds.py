@@ -182,7 +182,10 @@ def reconcile_at_start() -> None:
 
 @periodic_task("closed recordings")
 def find_closed_episodes() -> int:
-    """Close rows of episodes that a station repaired, or closed while the web was not running."""
+    """Close the rows of episodes whose closing this web has missed.
+
+    These are episodes that a station repaired, and episodes that a station closed while the web was not running.
+    """
     return services.close_unheard_episodes()
 
 

@@ -26,8 +26,8 @@ class EpisodeStatus(models.TextChoices):
 class EpisodeMode(models.TextChoices):
     """Way in which the robot was moved while an episode was recorded.
 
-    Runs have the modes from "continuous" to "manual". "observe" is a recording without a run, "collect" a
-    demonstration.
+    A run has one of the modes "continuous", "step", "preview", "sim" and "manual". The mode "observe" belongs to a
+    recording without a run, and "collect" to a demonstration.
     """
 
     CONTINUOUS = "continuous", "continuous"

@@ -15,7 +15,10 @@ _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 
 
 def success_of(path: Path) -> bool | None:
-    """Return the success in the newest score; None without a score. Voids of trials do not affect it."""
+    """Return the success in the newest score of the scores file at `path`; None if it contains no score.
+
+    A void of the trial does not change the result.
+    """
     success = None
     for _, line in read_numbered_lines(path):
         try:

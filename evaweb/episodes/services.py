@@ -193,7 +193,10 @@ def request_export(*, episode: Episode) -> Job:
 
 
 def request_smoothness(*, most: int) -> int:
-    """Queue the measurement of at most `most` closed runs not yet requested; return their number."""
+    """Queue smoothness measurements of closed runs, and return the number of queued runs.
+
+    At most `most` runs are queued, oldest first. A run whose measurement was requested before is not queued again.
+    """
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
     )

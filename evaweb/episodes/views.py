@@ -147,7 +147,10 @@ def player() -> dict[str, Any]:
 
 
 def replay_config(episode: Episode) -> dict[str, Any]:
-    """Return the settings of an episode for the page's modules; a video starts at its `start` [s]."""
+    """Return what the modules of the Replay page need to know about an episode: addresses, videos, grid and rate.
+
+    The `start` of a video is the time at which it starts on the page's clock [s].
+    """
     address = {
         name: reverse(f"episode-{name}", args=[episode.uuid])
         for name in ("curves", "geometry", "poses", "bench")

@@ -65,7 +65,7 @@ class JobTakenOver(Exception):
 
 
 class Cancelled(Exception):
-    """Error if a user has cancelled the job: stop."""
+    """Error that ends a job function after a user has cancelled the job."""
 
 
 class UnknownKind(EvaError):

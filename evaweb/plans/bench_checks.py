@@ -134,17 +134,24 @@ def confirm_cameras(*, user: User, station: Station, first: bool = False) -> Cam
 
 
 def references(*, station: Station, position: Position | None) -> dict[str, Reference]:
-    """Return the newest reference of each camera at a position; if `position` is None, of the cameras themselves."""
+    """Return the newest reference picture of each camera for a position.
+
+    If `position` is None, return the pictures that show the views of the cameras, independently of any layout.
+    """
     rows = Reference.objects.filter(station=station, position=position).order_by("pk")
     return {row.camera: row for row in rows}
 
 
 @transaction.atomic
 def record_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
-    """Make the current images the references of a position or, if `position` is None, of the cameras themselves.
+    """Make the current images the references of a position.
 
+    If `position` is None, they become the references that show the views of the cameras, independently of any layout.
     Older references stay in the record. Each new reference gets the regions of the one that it replaces, at the same
-    place in the picture. Raises: Conflict if a running plan uses one of the references as a gate.
+    place in the picture.
+
+    Raises:
+        Conflict: If a running plan uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
     images = image_store.current_images(station, cameras_of(station))

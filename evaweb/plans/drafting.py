@@ -65,7 +65,14 @@ def digest_of(values: Values) -> str:
 def merged(
     now: Values, was: Mapping[str, Any], wanted: Values, keep: Collection[str]
 ) -> tuple[Values, list[str]]:
-    """Return the fields to write, and the conflicting fields; those in `keep` are written in spite of a conflict."""
+    """Return the fields of a draft to write, and the names of the conflicting fields.
+
+    Args:
+        now: Values in the database.
+        was: Values that the user's form was loaded with.
+        wanted: Values that the user wants.
+        keep: Names of fields that are written in spite of a conflict.
+    """
     written, conflicts = {}, []
     for name, value in wanted.items():
         if name not in now or value == now[name]:
@@ -78,7 +85,12 @@ def merged(
 
 
 def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
-    """Set the draft's fields to `values`; of these, only positions, stations and checkpoints are saved here."""
+    """Set the draft's fields to `values`.
+
+    The positions, stations and checkpoints are saved here. The caller must save the other fields. The draft keeps those
+    of
+    its checkpoints whose ids are in `hidden`, because `values` cannot contain them.
+    """
     roles = _roles(plan)  # read before the change: their meaning depends on `comparing`
     for name in values.keys() & set(_PLAIN):
         setattr(plan, name, values[name])
@@ -118,7 +130,7 @@ def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None
 
 
 def _roles(plan: Plan) -> Roles:
-    """Return control and challenger of a draft by id."""
+    """Return the ids of the draft's control and challenger; an id is None if that checkpoint is not chosen."""
     if plan.comparing == Comparing.CONTROL:
         return plan.first_id, None
     return plan.second_id, plan.first_id

@@ -35,7 +35,7 @@ class StoppingRule(models.TextChoices):
 
 
 class PrimaryOutcome(models.TextChoices):
-    """Compared quantity."""
+    """Outcome of a trial that a plan compares between checkpoints."""
 
     SUCCESS = "success", "success"
     SCORE = "score", "score (partial credit)"

@@ -122,7 +122,10 @@ class _Coins:
 
 
 def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the numbers of trials of two checkpoints after each block."""
+    """Return, for each block, how many trials both checkpoints have had by its end.
+
+    `units` are the scheduled trials in order, and `names` are the names of the two checkpoints.
+    """
     counts: list[tuple[int, int]] = []
     for unit in units:
         if unit.block == len(counts):

@@ -76,7 +76,7 @@ class PlaceTable(Table):
 
 
 class PlanTable(Table):
-    """Plan, which becomes a draft."""
+    """Table of a plan in the file; its import creates a draft."""
 
     name: _Name
     title: _Name

@@ -143,7 +143,10 @@ def _first_station() -> Station:
 
 
 def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
-    """Return the server that a preflight would query; "" if the table is invalid, which the report explains."""
+    """Return the server that a preflight at the station would query; "" if the checkpoint's policy table is invalid.
+
+    An invalid table is no error here, because the report of the preflight explains it.
+    """
     args = {"policy": checkpoint.policy}
     command = Command(str(uuid4()), "policy_server", args, role=Role.OPERATOR, vouched=list(TABLES))
     ack = connection_to(station.name).request(command)

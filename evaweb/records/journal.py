@@ -246,7 +246,7 @@ def parse_model(model: type[AnyLine], content: Mapping[str, Any], what: str) -> 
 
 
 def _wrong(error: ValidationError) -> str:
-    """Return the first problem of a line, to be appended to its name."""
+    """Return the first problem of an invalid line, worded to follow the name of the line in a sentence."""
     first = error.errors()[0]
     if first["type"] == "json_invalid":
         reason, _, _ = first["ctx"]["error"].partition(" at line ")

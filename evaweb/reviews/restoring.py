@@ -61,10 +61,11 @@ def _reviews(episode: Episode, lines: Sequence[ReviewLine]) -> int:
 
 
 def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
-    """Update the rows of segments from the lines: each row becomes as in the segment's newest line.
+    """Update the episode's rows of segments from its lines; return the number of changed rows.
 
-    Returns the number of changed rows. Rows of segments without a line are deleted. If lines were skipped (not
-    `whole`), rows are only added, because the missing lines may have changed other rows.
+    Each row gets the values of its segment's newest line, and rows of segments without a line are deleted. If lines
+    were
+    skipped (`whole` is False), rows are only added, because the missing lines may have changed other rows.
     """
     by_uuid = {line.uuid: line for line in segments_of(lines)}
     changed = 0
@@ -87,7 +88,10 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
 
 
 def _tags(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
-    """Update the rows from the lines; if lines were skipped, rows are only added."""
+    """Update the episode's rows of tags from its lines; return the number of changed rows.
+
+    Rows of tags without a line are deleted. If lines were skipped (`whole` is False), rows are only added.
+    """
     tags = tags_of(lines)
     gone = Tag.objects.filter(episode=episode).exclude(pk__in=[line.uuid for line in tags])
     changed = gone.delete()[0] if whole else 0

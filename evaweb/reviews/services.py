@@ -111,9 +111,10 @@ def save_segment(
     milestone: str = "",
     segment: UUID | None = None,
 ) -> Segment:
-    """Mark frames `first` to `last`, inclusive; with `segment`, change that one, which must be the user's own.
+    """Mark the frames `first` to `last` (inclusive) as a new segment, or change an existing one.
 
-    Operators only; an administrator may change any.
+    With `segment`, the segment of that uuid is changed. The user must be an operator, and may change only segments of
+    their own; an administrator may change any segment.
     """
     require_role(user, Role.OPERATOR)
     label, milestone = (

@@ -1,1 +1,1 @@
-"""Django's database backend for SQLite, whose cursors end in the thread that opened them."""
+"""Django's database backend for SQLite, which closes cursors in the thread that opened them."""

@@ -309,10 +309,11 @@ def _queue_record(row: Command, answer: Answer) -> Command:
 
 
 def _stored_row(row: Command) -> Command:
-    """Store the row, or complete the first row with the same uuid by it; return the stored row.
+    """Store the row of a command, and return the stored row.
 
-    The first row gets an answer or a user that it lacks. An e-stop press whose uuid belongs to another command gets its
-    own row.
+    If a row with the same uuid exists, that first row is returned. An answer or a user that the first row lacks is
+    copied
+    to it. An e-stop press whose uuid belongs to another command gets its own row.
     """
     _resolve(row)
     try:
@@ -336,10 +337,12 @@ def _merged(row: Command) -> Command:
 
 
 def _merged_fields(row: Command, first: Command) -> list[str]:
-    """Return the names of fields that `row`, a record of a stop, can add to `first`, which arrived on another path.
+    """Return the names of the fields of `first` that `row` can fill in or replace.
 
-    The fields of the answer are among them if `first` has no answer, if only `row` has an answer by which the stop was
-    carried out, or if only `row` has latched the stop anew. User and args are among them if only `row` has a user.
+    `row` is a record of the same stop as `first`, and arrived on another path. The fields of the answer are included in
+    three cases: `first` has no answer; only the answer in `row` says that the stop was carried out; or only the answer
+    in
+    `row` says that this press latched the stop. The fields `user` and `args` are included if only `row` has a user.
     """
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"

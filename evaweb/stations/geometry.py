@@ -79,7 +79,7 @@ def _frames(drawn: DrawnRobot) -> list[dict[str, Any]]:
 
 
 def _link(drawn: DrawnRobot, arm: Group, link: str) -> str:
-    """Return a link's name, prefixed by its arm's if several parts have that name."""
+    """Return the name of a link, with the name of its arm in front if several parts have the same link name."""
     return link if len(drawn.scene.parts_showing(link)) == 1 else f"{arm.name}/{link}"
 
 

@@ -112,9 +112,11 @@ def _sentence(value: object) -> str:
 
 
 def _sentences(snapshot: Mapping[str, Any], redacted: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ids and arguments of the sentences whose text is shown unchanged.
+    """Return the references to sentences (id and arguments) whose text is the same in the redacted snapshot.
 
-    A sentence is left out if its arguments contain anything beyond that text.
+    A page uses such a reference to translate the text. A reference is left out if its arguments contain anything that
+    the
+    text does not show.
     """
     before, now = texts(snapshot), texts(redacted)
     return {

@@ -71,7 +71,10 @@ def scene_surroundings(looks: DrawnRobot) -> dict[str, Any]:
 
 
 def bounds(visual: Visual, part: Float64) -> Box:
-    """Return the bounding box in the scene of a shape on a part at `part` [4, 4]."""
+    """Return the bounding box in the scene of a shape that belongs to a part of the robot.
+
+    `part` is the pose of that part in the scene, as a homogeneous matrix [4, 4].
+    """
     low, high = visual.bounds()
     placed = part @ visual.origin
     middle = placed[:3, :3] @ ((low + high) / 2) + placed[:3, 3]

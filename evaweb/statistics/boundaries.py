@@ -417,12 +417,21 @@ def _within(
     spent: NDArray[np.float64],
     most: float,
 ) -> tuple[int, NDArray[np.float64]]:
-    """Return how many tables may stop, and the error at each rate if they do; for a design that tests equal rates.
+    """Return how many tables can join the stopping region, and the error at each rate with these tables included.
 
-    The tables are ordered from the most extreme downwards; the number of tables must end at one of the indices in
-    `ends`. `numbers` are the total successes of the tables, `even` their probabilities at rates of 0.5, `spent` is the
-    error at each rate so far, and `most` the largest error allowed. The error grows with the number of tables at every
-    rate, so the number is found by bisection.
+    This function is for a design that tests whether both rates are equal. The tables are ordered from the most extreme
+    downwards. The last table that joins must be at one of the indices in `ends`. The error grows with the number of
+    tables
+    at every rate, so the number is found by bisection.
+
+    Args:
+        null: Null hypothesis, with the grid of common rates.
+        trials: Trials of both arms together.
+        numbers: Total successes of each table.
+        even: Probability of each table at rates of 0.5.
+        ends: Indices of the tables that may be the last one.
+        spent: Error at each rate so far.
+        most: Largest error allowed.
     """
     import numpy as np
 

@@ -65,7 +65,7 @@ class Design:
 
     @property
     def unit(self) -> str:
-        """Unit of the sequence: "pairs" or "blocks"."""
+        """Unit in which the design counts its sequence of trials: "pairs" or "blocks"."""
         return "pairs" if self.counts is None else "blocks"
 
 
@@ -325,7 +325,12 @@ def _stepped(frozen: Design, blocks: Sequence[Block], conclusions: list[Conclusi
 
 
 def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]) -> list[Block]:
-    """Return the blocks before the first that lacks an arm which was not dropped before it."""
+    """Return the blocks up to the first incomplete one, which is not returned.
+
+    A block is incomplete if it lacks an arm that was still in use. `dropped` maps each dropped arm to the number of
+    blocks
+    after which it was dropped.
+    """
     complete = []
     for number, block in enumerate(blocks):
         present = {arm for arm, _ in block}
@@ -388,7 +393,12 @@ def _complete_blocks(frozen: Design, blocks: Sequence[Block], pair: tuple[int, i
 
 
 def _succeeded(blocks: Sequence[Sides]) -> tuple[float, float]:
-    """Return p of the single test of a fixed number of blocks, and the first arm's rate minus the second's."""
+    """Return the p-value of a design with one test after a fixed number of blocks, and the difference of the rates.
+
+    The difference is the first arm's success rate minus the second's. Without trials of an arm, the p-value is 1 and
+    the
+    difference is 0.
+    """
     (first, n), (second, m) = (_sum(blocks, side) for side in (0, 1))
     if not n or not m:
         return 1.0, 0.0
@@ -456,7 +466,7 @@ def of_so_many(found: Design, blocks: int) -> Design:
 
 
 def in_blocks(values: Sequence[Values]) -> list[Block]:
-    """Return paired blocks of two arms from their outcomes."""
+    """Return one block of two trials for each pair of outcomes: the first of arm 0, the second of arm 1."""
     return [((0, first), (1, second)) for first, second in values]
 
 
@@ -467,7 +477,12 @@ def look_schedule(found: Design) -> list[int]:
 
 
 def boundary_table(found: Boundary) -> list[list[int]]:
-    """Return the boundary as JSON: per look the trials of each arm, then the least extreme stopping table, if any."""
+    """Return the boundary as JSON, with one list of integers per look.
+
+    A list has the trials of the first and the second arm. If a table can stop at this look, the successes of both arms
+    in
+    the least extreme such table follow.
+    """
     return [[table.first, table.second, *(table.least or ())] for table in found.looks]
 
 

@@ -42,7 +42,9 @@ class NotIdentifiedError(StatisticsError):
 class Comparison:
     """Comparison of two runs; `first` was run or shown first.
 
-    `weight` is its share if several people compared the same two runs, so that these count as one comparison.
+    If several people compared the same two runs, each of these comparisons gets a `weight` below 1, so that together
+    they
+    count as one comparison.
     """
 
     first: str
@@ -190,7 +192,14 @@ class _Design:
                 row[0, -1], row[1, -1] = 0.5, -0.5
 
     def check(self) -> None:
-        """Raise NotIdentifiedError unless a finite, unique estimate exists; exact, by rank and linear program."""
+        """Raise NotIdentifiedError unless a finite and unique estimate exists.
+
+        The decision is exact: it uses the rank of the design and a linear program.
+
+        Raises:
+            NotIdentifiedError: If no such estimate exists.
+            StatisticsError: If the linear program could not be solved.
+        """
         import numpy as np
         from scipy.optimize import linprog
 

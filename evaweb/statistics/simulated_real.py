@@ -23,8 +23,10 @@ _FEWEST_OF_EACH = 5  # fewest real successes and failures: near 0 and 1 the inte
 
 @dataclass(frozen=True, slots=True)
 class Powered:
-    """Real outcomes of one arm (0 to 1), each `paired` with a simulated outcome, and further simulated outcomes
-    (`beside`).
+    """Outcomes of one arm (0 to 1), real and simulated.
+
+    `paired` has each real outcome with the simulated outcome that belongs to it. `beside` has the further simulated
+    outcomes.
     """
 
     paired: Sequence[Pair]

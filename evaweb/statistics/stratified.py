@@ -92,9 +92,10 @@ def mantel_haenszel(tables: Sequence[StratumTable]) -> Stratified:
 
 
 def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None:
-    """Return the two-sided exact probability, within strata, of a total at least as improbable if both arms are equal.
+    """Return the two-sided p-value of the exact test that both arms are equal within every stratum.
 
-    None if fewer than `least` strata are informative.
+    The p-value is the probability of all totals of the first arm that are at most as probable as the observed total.
+    Return None if fewer than `least` strata are informative.
     """
     telling = [table for table in tables if table.is_informative]
     if len(telling) < least:

@@ -144,7 +144,10 @@ class TrialRecord(Line):
 
     @classmethod
     def for_manifest(cls, trial: Trial) -> dict[str, Any]:
-        """Return the columns known before the run, for the manifest; the uuid is unique across databases."""
+        """Return the columns of a trial that are known before its run, for the episode's manifest.
+
+        The trial's uuid is among these columns, and is unique across databases.
+        """
         whole = cls.written(trial)
         return {name: value for name, value in whole.items() if COLUMNS[name].written == "before"}
 

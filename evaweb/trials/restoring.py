@@ -144,7 +144,10 @@ def _trial(facts: TrialRecord, run: RestorableRun, episode: Episode | None) -> t
 
 
 def _episode(facts: TrialRecord, run: RestorableRun, episode: Episode | None) -> Episode | None:
-    """Return the recording, created as missing if its folder is lost too; None for a trial without recording."""
+    """Return the trial's recording; None for a trial without a recording.
+
+    If the folder of the recording is lost, its row is created with the status "missing".
+    """
     if episode is not None or run.uuid == facts.uuid:
         return episode
     return episodes.create_missing_episode(

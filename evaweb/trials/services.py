@@ -504,7 +504,10 @@ def _times_before(
 
 
 def require_scorable(trial: Trial, reason: str) -> None:
-    """Raise Conflict or EvaError if the trial cannot be scored, or corrected for that `reason`."""
+    """Raise Conflict or EvaError if the trial cannot be scored.
+
+    A trial that is scored already can only be corrected, and needs a `reason` for that.
+    """
     lifecycle.require(trial, Transition.SCORE)
     if trial.status == TrialStatus.SCORED and not reason:
         raise EvaError(_SCORED_ALREADY(trial=trial.pk))

@@ -190,7 +190,10 @@ def _set_up(trial: Trial, request: Mapping[str, Any]) -> Command:
 
 
 def _setup_identity(args: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments that identify a set-up, without the least durations, which are drawn anew each time."""
+    """Return the arguments that identify a set-up.
+
+    The least durations of the set-up's stages are left out, because they are drawn anew for each set-up.
+    """
     return {key: value for key, value in args.items() if key != "least"}
 
 

@@ -92,7 +92,9 @@ class FileCopies:
     def _steady(self, unit: str) -> list[Listed]:
         """Copy a folder and return its files.
 
-        The copy is repeated until the folder did not change meanwhile; after the last try it is added to `changing`.
+        The copy is repeated until the folder does not change while it is copied. If the folder changes during every
+        try, it
+        is added to `changing`, and the last copy is kept.
         """
         for _ in range(_TRIES):
             names = list(self._walk(unit))

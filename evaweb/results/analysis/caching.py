@@ -108,8 +108,9 @@ def cached_analysis(plan: Plan, only: TrialFilter | None = None, at: Hashable = 
 
 
 def recipes_of(plan: Plan) -> dict[str, str]:
-    """Return the recipe by checkpoint, for training runs only: the same weights served in several ways are
-    not separate runs.
+    """Return the training recipe of each checkpoint that is a separate training run.
+
+    Checkpoints that are the same weights, served in several ways, are left out, because they are not separate runs.
     """
     rows = (plan.document or {}).get("checkpoints", ())
     weights = Counter(row["digest"] for row in rows if row.get("digest"))

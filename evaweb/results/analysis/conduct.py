@@ -45,7 +45,7 @@ _delays: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 
 @dataclass(frozen=True, slots=True)
 class AttemptRecord:
-    """Attempt in the order of allocation; delays in s, None if unknown.
+    """One attempt of a plan. All delays are in s, and None if unknown.
 
     `match` is the smallest agreement of a camera's image with its reference at the last bench check before the run;
     `override` is the reason for which a low match was accepted.

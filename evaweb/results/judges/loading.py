@@ -24,7 +24,10 @@ _JUDGE_KIND_ALLOWED = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class UsableJudge:
-    """Judge that is ready for use; `pictures` is True if it is shown images, False if the bench's truth."""
+    """Judge that is ready for use.
+
+    `pictures` is True if the judge is shown images, and False if it is given the ground truth of a simulated bench.
+    """
 
     name: str
     version: str

@@ -176,9 +176,10 @@ _Left = list[tuple[Design, list[Block]]]  # by comparison: its own design, and t
 
 
 def _stepped(design: Design, left: _Left) -> _Left:
-    """Return each design with the share of alpha that Holm's procedure gives it, and its blocks.
+    """Return the comparisons with each design's alpha replaced by the share that Holm's procedure gives it.
 
-    The result is `left` if the plan does not use the procedure. A comparison without blocks counts as a step too.
+    `left` contains the design and the remaining blocks of each comparison; the blocks are unchanged. `left` itself is
+    returned if the plan does not use the procedure. A comparison without blocks counts as a step too.
     """
     if not design.holm:
         return left

@@ -110,7 +110,7 @@ class Citation:
 
     @property
     def revealed_by(self) -> str:
-        """Name that the account which revealed the plan had at that time."""
+        """Name of the account that revealed the plan, as it was at the reveal."""
         own = self.plan.revealed_by.get_username() if self.plan.revealed_by else ""
         return str(self.kept.get("by") or own)
 

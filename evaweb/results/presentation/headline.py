@@ -51,11 +51,12 @@ class Headline:
     Attributes:
         corrected: Alternative with the scores as corrected after the reveal.
         at_first: Alternative with every first score and no voids.
-        worst: Alternative with every attempt that was discarded unscored counted against the result.
+        worst: Alternative in which every attempt without a score that was discarded counts against the result.
         estimates: Corrected differences of comparisons that stopped early.
         versions: Headlines of earlier versions of the plan.
-        letters: If all checkpoints were compared with each other: two share a letter if they were not separated.
-        best: Which checkpoint is best, if all were compared with each other and one is.
+        letters: Name and letters of each checkpoint, if all were compared with each other. Two checkpoints that share a
+            letter were not separated.
+        best: Sentence on the best checkpoint, if all were compared with each other; else "".
         setting: Robot, scenes, dates and scorers.
     """
 

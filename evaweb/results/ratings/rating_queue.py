@@ -157,10 +157,16 @@ def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
 
 
 def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> NextItem[T]:
-    """Return the first item with all images, else the first whose images may still arrive.
+    """Return the next item to rate: the first with all images, else the first whose images may still arrive.
 
-    `of` gives the trials of an item. The attribute `passed` of the result has the codes of trials whose images are
-    missing, `left` is `count`. `waiting` is read no further than necessary.
+    The result also names, as `passed`, the codes of the trials without images that were skipped on the way. `waiting`
+    is
+    read no further than necessary.
+
+    Args:
+        waiting: Items that wait for a rating, in order.
+        count: Number of waiting items, which becomes `left` of the result.
+        of: Function that returns the handouts of an item's trials.
     """
     for is_present, items in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
         passed: list[str] = []

@@ -144,7 +144,10 @@ def _estimate(difference: Difference | None) -> list[float] | None:
 
 
 def plan_seal(plan: Plan) -> dict[str, Any]:
-    """Return digest and commitment, and the key if it was revealed."""
+    """Return the plan's digest and commitment, and the record of its reveal.
+
+    The key of the commitment is included if the plan was revealed or the record exists; otherwise `key` is "".
+    """
     visible = plan.state == PlanState.REVEALED or plan.at_reveal is not None
     return {
         "digest": plan.digest,

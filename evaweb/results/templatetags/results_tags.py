@@ -139,7 +139,7 @@ def shared(total: float, among: int) -> float:
 
 @register.filter
 def minus(count: int, shown: list[Any]) -> int:
-    """Return the number of items that are not shown, of `count`."""
+    """Return how many of `count` items are not among those `shown`."""
     return count - len(shown)
 
 

@@ -13,7 +13,7 @@ from evaweb.lab import sentences
 
 
 class Command(BaseCommand):
-    """Command that prints the catalogue or the comparison as JSON."""
+    """Command that prints all sentences of the product as JSON, or compares the file of a language with them."""
 
     help = (
         "Prints id, English pattern and arguments of every sentence as JSON. With the FILE of a language it prints "

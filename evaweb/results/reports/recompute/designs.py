@@ -150,7 +150,10 @@ class _Stood:
 
 
 def _stood(row: Mapping[str, str], by_trial: Mapping[str, Sequence[Mapping[str, str]]], at: str) -> _Stood:
-    """Return the trial with the last score given at or before `at`; it does not count if there was none."""
+    """Return the trial as it was at the time `at`, with the last score given by then.
+
+    A trial without a score at that time does not count.
+    """
     then = datetime.fromisoformat(at)
     before = [score for score in by_trial[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
     counts = row["status"] == "scored" and bool(before)

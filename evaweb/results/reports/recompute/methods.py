@@ -79,7 +79,10 @@ def wilson(x: int, n: int) -> Ends:
 
 
 def clopper_pearson(x: int, n: int) -> Ends:
-    """Return the rates at which neither tail at x has a probability below 2.5 %."""
+    """Return the ends of the 95 % Clopper-Pearson interval of the success rate for x successes in n trials.
+
+    Within the interval, x or fewer successes and x or more successes both have a probability of at least 2.5 %.
+    """
     low = 0.0 if x == 0 else solve(lambda p: math.fsum(mass(n, p)[x:]), 0.025, 0.0, 1.0)
     high = 1.0 if x == n else solve(lambda p: -math.fsum(mass(n, p)[: x + 1]), -0.025, 0.0, 1.0)
     return [low, high]

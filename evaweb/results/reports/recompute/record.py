@@ -117,9 +117,10 @@ def changes(
     seal: Mapping[str, Any],
     record: Mapping[str, Any],
 ) -> list[str]:
-    """Return what was changed after the reveal, by the digests in its record; [] before a reveal.
+    """Return one sentence for each part of the data that was changed after the reveal; [] before a reveal.
 
-    `judged` are the tables of raters and judges.
+    Changes are found by comparing digests of the data with those that the reveal recorded. `judged` are the tables of
+    raters and judges.
     """
     reveal = seal["at_reveal"]
     if not reveal:
