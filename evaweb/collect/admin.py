@@ -1,4 +1,7 @@
-"""Read-only admin pages of sessions; only services write the rows, after the disk."""
+"""Read-only admin pages of sessions.
+
+Only services write the rows, after they have written the same content to the disk.
+"""
 
 from __future__ import annotations
 

@@ -83,9 +83,10 @@ class AimQueries:
 
 
 def _refused(reason: str) -> dict[str, Any]:
-    """Return a refused answer to a query.
+    """Return the answer that refuses a query for `reason`.
 
-    Its `sentence` holds the reason's pattern id and arguments, because the answer's own "id" is that of the query.
+    If `reason` is a translatable sentence, its pattern id and arguments are in the nested `sentence`. They cannot be at
+    the top level, where the key "id" is the id of the query.
     """
     fields = {"sentence": identity(reason)} if isinstance(reason, Sentence) else {}
     return {"ok": False, "reason": reason, **fields}

@@ -49,8 +49,9 @@ class BodyBound:
         largest: Limit [bytes].
         status: HTTP status of the refusal. 0 means no refusal: a longer body is dropped and the request continues.
         sentence: Message of the refusal.
-        sure: Limit [bytes] for users other than administrators, and for bodies of unknown length. If a body is longer,
-            the sessions in `keys` are looked up to find the user, who is that of the first session that has one.
+        sure: Limit [bytes] for users other than administrators, and for bodies of unknown length. To find out who
+            sends a longer body, the sessions in `keys` are looked up in order. The sender is the user of the first
+            session that has a user.
         keys: Keys of the sessions that the request names.
         may_press: Whether the request may be an e-stop press. If the first `largest` bytes of a longer body are indeed
             a press, the rest of the body is dropped, and the body is not refused.

@@ -41,7 +41,7 @@ def changed_names(before: ChangeMarks, now: ChangeMarks) -> list[str]:
 
 
 def change_marks(station: str) -> ChangeMarks:
-    """Return one mark per topic that differs after every change of its rows."""
+    """Return one mark per topic; the mark of a topic is another one after every change of the topic's rows."""
     of_station = Q(station__name=station)
     return {
         "lease": (

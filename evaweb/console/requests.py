@@ -78,7 +78,11 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """Request for the events of `boot` after a number, or all if the boot has changed; "" is the current boot."""
+    """Request for the station's events with a number above `after`.
+
+    `boot` is the boot of the runtime that numbered the events, "" for the current boot. If the runtime has started anew
+    since that boot, all events are requested.
+    """
 
     after: int
     boot: str

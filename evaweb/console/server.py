@@ -105,7 +105,10 @@ class _Server(Server):
             await until_read(protocol)
 
     def listen_success(self, port: Any) -> None:
-        """Wrap Daphne's factory with ours, after Daphne has started to listen with its own."""
+        """Replace the protocol factory of the listening port by one that applies this project's limits.
+
+        Daphne calls this method after it has started to listen with its own factory.
+        """
         super().listen_success(port)
         port.factory = self._entrance(port.factory)
         self.ws_factory.protocol = LimitedWebSocket

@@ -179,7 +179,11 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
 
 
 def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:
-    """Return the job's key: one check or repair per dataset at a time, but different keys for other orders."""
+    """Return the key of the job that carries out an order; jobs with the same key exclude each other.
+
+    For a check or a repair the key depends only on the dataset, so that each dataset has at most one such job at a
+    time. The keys of other orders also depend on their arguments.
+    """
     if what in ("check", "repair"):
         return f"dataset:{what}:{_short(name)}"
     suffix = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]

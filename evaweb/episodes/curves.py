@@ -65,7 +65,10 @@ def curve_streams(
     unscored: bool = False,
     milestones: Sequence[tuple[float, str]] = (),
 ) -> bytes:
-    """Return the message of `curve_message` for an open episode."""
+    """Return the message that `curve_message` describes, for an episode that is opened already.
+
+    The other arguments are those of `curve_message`.
+    """
     start = _start(episode)
     if covered:
         episode = _redacted(episode)
@@ -114,7 +117,10 @@ def _redacted(episode: Episode) -> Episode:
 
 
 def _numbers(episode: Episode) -> dict[str, Any]:
-    """Return the `units` of the joints and the indices of `grippers`; unknown if the robot has changed since."""
+    """Return the units of the joints (`units`) and the indices of the gripper joints (`grippers`).
+
+    If the robot's description has changed since the recording, each unit is "" and no joint counts as a gripper.
+    """
     try:
         drawn = drawn_robot_for(episode.manifest)
     except NotFound:
@@ -278,7 +284,11 @@ def _played(at: float, holds: Sequence[Sequence[float]]) -> float:
 def _milestones(
     episode: Episode, unscored: bool, scored: Sequence[tuple[float, str]]
 ) -> list[dict[str, Any]]:
-    """Return marks of the scored milestones, else those of the ground truth unless hidden."""
+    """Return marks of the milestones, at the times at which they were reached.
+
+    Marks of the scored milestones are returned if there are any. Otherwise the marks come from the ground truth of a
+    simulated bench; there are none if these must stay hidden (`unscored`).
+    """
     labelled = list(scored)
     if not labelled and not unscored:
         fps = episode.layout.fps

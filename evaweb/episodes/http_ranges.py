@@ -70,7 +70,10 @@ def range_holds(if_range: str | None, validators: Validators) -> bool:
 
 
 def not_modified(if_none_match: str | None, if_modified_since: str | None, validators: Validators) -> bool:
-    """Return True if the client has this version already; if it sent a tag, only that decides."""
+    """Return True if the client already has this version of the file.
+
+    If the client sent an entity tag (`if_none_match`), only the tag decides, and the time of modification is ignored.
+    """
     if if_none_match is not None:
         tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
         return "*" in tags or validators.etag in tags

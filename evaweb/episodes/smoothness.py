@@ -103,7 +103,13 @@ def _none(reason: str) -> Smoothness:
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """Joints [N, D] at `times` [N] in s, NaN if unknown, and whether the robot was asked to move."""
+    """Samples of the robot's joints.
+
+    Attributes:
+        times: Time of each sample [N] [s].
+        joints: Joint positions [N, D], NaN if unknown.
+        asked: Whether the robot was asked to move at each sample [N].
+    """
 
     times: Array
     joints: Array

@@ -136,7 +136,10 @@ def claim(*, queue: str, owner: UUID) -> Job | None:
 
 
 def run_queue(queue: str) -> int:
-    """Execute the ready jobs of `queue` one after the other and return their number; 0 if already executing."""
+    """Execute the ready jobs of `queue` one after the other and return their number.
+
+    If this process is executing jobs already, nothing is done and 0 is returned.
+    """
     if not _busy.acquire(blocking=False):
         return 0
     try:

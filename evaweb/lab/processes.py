@@ -41,8 +41,8 @@ class LabError(EvaError):
 class ProgramSpec:
     """Specification of a program: the process `python ARGUMENTS --lifeline`.
 
-    If `announces` is set, the program prints its addresses as a line of JSON when it is ready. For a restart, `again`
-    converts these addresses to arguments, so that the program has them again.
+    If `announces` is set, the program prints its addresses as a line of JSON when it is ready. `again` converts these
+    addresses to arguments for a restart, so that the restarted program listens at the same addresses.
     """
 
     name: str

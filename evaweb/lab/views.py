@@ -131,7 +131,7 @@ def draft(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def check_draft(request: HttpRequest, name: str) -> HttpResponse:
-    """Render the errors that the runtime's check finds in a deployment as a fragment."""
+    """Check a deployment with the runtime, and render the errors as a fragment of the page."""
     require_role(request.user, Role.ADMIN)
     return render(request, "lab/checked.html", {"faults": deployments.faults_of(_kept(name).path)})
 

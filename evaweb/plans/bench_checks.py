@@ -249,7 +249,7 @@ class CameraMatch:
 def current_matches(*, trial: Trial) -> list[CameraMatch]:
     """Return the current match of each camera that has a reference at the trial's position.
 
-    [] if the trial is not prepared any more, because a polling page may be a moment late.
+    Return [] if the trial is no longer prepared. This is no error, because a page that polls may ask a moment too late.
     """
     if trial.status != TrialStatus.PREPARED:
         return []

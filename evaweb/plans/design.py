@@ -174,12 +174,14 @@ class Tried:
 class Attempt:
     """Scored or interrupted attempt at a trial of a compared checkpoint.
 
+    Scores that were given after the plan's result was stored are ignored.
+
     Attributes:
         slot: Index of the scheduled trial.
         block: Block of that trial.
         counts: Whether the attempt's score counts.
         outcome: Outcome by the attempt's newest score, None without a score.
-        first: Outcome by its first score, None without a score. Both ignore scores after the result was stored.
+        first: Outcome by the attempt's first score, None without a score.
         attempt: Number of the attempt; above 1 if an earlier attempt did not count.
     """
 
@@ -354,11 +356,11 @@ def crossed_while_waiting(plan: Plan, since: datetime) -> str:
 
 
 def visible_close_reason(plan: Plan, sealed: bool) -> str:
-    """Return why the plan was closed.
+    """Return the reason for which the plan was closed.
 
-    If the plan is `sealed` for the reader, only a reason that the server gave is returned, and "" in place of an
-    owner's. Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not
-    taken for one of them.
+    If the plan is `sealed` for the reader, a reason that its owner gave is replaced by "". A reason that the server
+    gave is always returned. Since format 6 the server's reason is recorded, and only an identical text counts as such.
+    For older plans it is recognised by its first words, with which an owner's reason could begin too.
     """
     if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
         own = any(plan.closed_because.startswith(f"{text}, after ") for text in ENDED.values())

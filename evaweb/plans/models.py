@@ -74,8 +74,8 @@ class TimeCountsAs(models.TextChoices):
 class Plan(models.Model):
     """One version of an evaluation: editable as a draft, immutable once frozen.
 
-    `document` and its `digest` are the frozen form. `key` is the secret from which schedule, codes and commitment are
-    derived, until the reveal.
+    `document` and its `digest` are the frozen form. Schedule, codes and commitment are derived from `key`, which is
+    secret until the reveal.
     """
 
     name = models.SlugField(max_length=60, help_text="Of all its versions; in addresses and exports.")

@@ -208,7 +208,13 @@ class Journal(Generic[AnyLine]):
         return Path(settings.DATA_DIR) / self.folder / f"{uuid}.jsonl"
 
     def append(self, uuid: UUID, line: Mapping[str, Any]) -> None:
-        """Append one line and wait until it is on the disk; hold a row lock. Raises: NotWritten."""
+        """Append one line and wait until it is on the disk.
+
+        The caller must hold a lock on the database row to which the file belongs.
+
+        Raises:
+            NotWritten: If the disk refuses the line.
+        """
         append_line(self.path(uuid), line)
 
     def read(self, uuid: UUID, say: Callable[[str], None]) -> list[AnyLine]:

@@ -1,4 +1,7 @@
-"""Admin pages of reviews: read-only, as services write the rows after the disk; segment labels can be edited."""
+"""Admin pages of reviews: rows are read-only, but the labels of segments can be edited.
+
+Only services write the rows, after they have written the same content to the disk.
+"""
 
 from __future__ import annotations
 

@@ -41,9 +41,13 @@ def digest_of(folders: Iterable[Path], *versions: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """File ready for sending; `packed` is empty if gzip does not shrink it.
+    """File that is ready for sending.
 
-    `changed`: modification time; a file newer than the process may differ from the content that the digest stands for.
+    Attributes:
+        packed: Content compressed with gzip, empty if the compression does not shrink it.
+        tag: Entity tag.
+        changed: Modification time. If it is later than the start of this process, the content may differ from that
+            for which the digest in the URL stands.
     """
 
     content: bytes

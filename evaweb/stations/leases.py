@@ -198,7 +198,10 @@ def _end_reason(lease: Lease, boot: str) -> str:
 
 
 def _require_commander(user: Any) -> None:
-    """Raise NotAllowed if a requesting user has been deactivated or has become a viewer since."""
+    """Raise NotAllowed if the user who requested the lease may no longer command a station.
+
+    Since the request, the user may have been deactivated or have become a viewer.
+    """
     if not user.is_active:
         raise NotAllowed(_USER_SWITCHED_OFF(user=user.get_username()))
     require_role(user, Role.OPERATOR)

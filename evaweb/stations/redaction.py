@@ -92,9 +92,9 @@ def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, An
 
 
 def _reason(text: object, sentence: object, visibility: Visibility, covered: str) -> str:
-    """Return the reason for the station's state as it may be shown, else `covered`.
+    """Return the reason for the station's state, or `covered` if the user may not see that reason.
 
-    `text` is the reason, and `sentence` has its id and arguments, or is None.
+    `text` is the reason. `sentence` has the pattern id and arguments of that text, or is None.
     """
     return visibility.redact_text(
         _sentence({"text": str(text or ""), **(sentence if isinstance(sentence, Mapping) else {})}), covered

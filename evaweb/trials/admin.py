@@ -376,7 +376,10 @@ class CheckpointAdmin(ActiveActions, LogsValues):
         return to_delete, counts, perms_needed, [*protected, *texts]
 
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
-        """Warn if trials or a frozen plan use the checkpoint with another policy or strategy table."""
+        """Save the checkpoint; warn after a change of policy or strategy if trials or a frozen plan use it.
+
+        The warning says that trials with the old and the new table would be counted together.
+        """
         super().save_model(request, obj, form, change)
         if change and {"policy", "strategy"} & {*form.changed_data} and checkpoint_used(obj):
             messages.warning(

@@ -65,7 +65,7 @@ class Column(RowPath):
 class TrialRecord(Line):
     """Record of a trial, with columns in display order.
 
-    Columns that are never written to files are None or "" in a record read from one.
+    Some columns are never written to files. In a record that was read from a file, these columns are None or "".
     """
 
     id: Annotated[

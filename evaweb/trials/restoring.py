@@ -240,10 +240,11 @@ def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
 
 
 def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
-    """Return the score that counts: normally that of the last of `lines`.
+    """Return the score that counts.
 
-    `lines` are those of one scores file. If the trial's current score was restored from another file (a trial has two
-    if its episode was found late) and is newer, that score counts.
+    Normally it is the score of the last of `lines`, which are the lines of one scores file. A trial has two scores
+    files if its episode was found late. If the trial's current score was restored from the other file and is newer, the
+    current score counts.
     """
     newest, current = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
     elsewhere = current is not None and current.uuid not in [line.uuid for line in lines]

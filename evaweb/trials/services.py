@@ -343,15 +343,16 @@ def score_trial(
     reason: str = "",
     uuid: UUID | str | None = None,
 ) -> Score:
-    """Add a score; for a scored trial it is a correction, which needs a reason and counts from then on.
+    """Add a score to a trial. For a scored trial it is a correction, which needs a reason and counts from then on.
 
-    Written to the journal first, then to the database, then published. A repeated `uuid` (or, without one, a score
-    identical to this rater's current one) is a repetition whose answer was lost: the first score is returned.
+    The score is written to the journal first, then to the database, and then published. A request can be a repetition
+    because its answer was lost: if its `uuid` was used before or, without a `uuid`, if the score is identical to this
+    rater's current one. Then the first score is returned.
 
     Args:
         milestones: Milestone id -> reached, for every milestone of the scene.
-        times: Milestone id -> time of reaching it [s after the start of the run], if known; None in a correction
-            takes those of the current score.
+        times: Milestone id -> time of reaching it [s after the start of the run], if known. If `times` is None in a
+            correction, the times of the current score are taken.
         failure, failure_phase: See `failures.check_failure`.
 
     Raises:
@@ -553,7 +554,10 @@ def _outcomes(score: Score, outcome: ScoredOutcome) -> list[MilestoneOutcome]:
 
 
 def counts_now(trial: Trial, score: Score, outcomes: Sequence[MilestoneOutcome], user: User) -> None:
-    """Store a new score with its outcomes, which counts from then on: journal first, then rows, then publication."""
+    """Store a new score of the trial with its milestone outcomes; this score counts from then on.
+
+    The score is written to the journal first, then to the database, and its publication is requested last.
+    """
     milestones = [OutcomeLine.written(outcome) for outcome in outcomes]
     JUDGEMENTS.append(journal_uuid(trial), ScoreLine.written(score, milestones=milestones))
     score.save()

@@ -111,7 +111,10 @@ def _find_trial_of(station: Station, episode: UUID | None) -> None:
 
 
 def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
-    """Apply the event of an accepted `run`: later events of the station concern this trial."""
+    """Begin the trial's run when the station reports that it has started to run; return the trial, or None.
+
+    The number of this event is stored, because later events of the station concern this trial.
+    """
     data = event.get("data") or {}
     before, after = (SessionState.meaning_of(str(data.get(end))) for end in ("from", "to"))
     if after is None or not after.going or (before is not None and before.going):

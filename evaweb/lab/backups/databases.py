@@ -31,7 +31,10 @@ class Database(Protocol):
         """Write a consistent dump; return the number of rows of each table."""
 
     def read(self, path: Path) -> Rows:
-        """Check a dump; return its number of rows of each table, {} if only a server could count them."""
+        """Check a dump, and return the number of rows of each table.
+
+        The result is {} if the rows cannot be counted without a database server, as for PostgreSQL.
+        """
 
     def require_empty(self) -> None:
         """Raise BackupError if the database has a table."""

@@ -216,15 +216,15 @@ class Arm:
         exact: Clopper-Pearson interval of the success rate.
         macro: Mean of the scenes' success rates, with equal weights.
         cells: Success by initial condition.
-        curve: Cumulative successes over time [s], up to one horizon for all arms; a failed trial has not succeeded
-            by then.
+        curve: Cumulative successes over time [s], up to one horizon for all arms. A failed trial is regarded as not
+            having succeeded up to the horizon.
         mean_time: Restricted mean time to success [s] up to the same horizon.
         speed: Successes per hour of running.
         interventions: Interrupted runs per hour of running.
         failures: Failure modes, most frequent first.
         smoothness: SPARC of the measured motion, over the trials with a recording.
         commanded: SPARC of the sent commands.
-        series: Index of its colour in every figure of its evaluation.
+        series: Index of the colour that the checkpoint has in every figure of its evaluation.
     """
 
     checkpoint: str

@@ -135,12 +135,12 @@ class ComparedTrials:
 
     @property
     def successes(self) -> list[tuple[bool, bool]]:
-        """Success of the first and of the second checkpoint, for each pair in `evidence`."""
+        """Successes of the first and of the second checkpoint, for each of the pairs that count as evidence."""
         return [(pair.first.success, pair.second.success) for pair in self.evidence]
 
     @property
     def scores(self) -> list[tuple[float, float]]:
-        """Score of the first and of the second checkpoint, for each pair in `evidence`."""
+        """Scores of the first and of the second checkpoint, for each of the pairs that count as evidence."""
         return [(pair.first.score, pair.second.score) for pair in self.evidence]
 
     def tables(self, stratum: str) -> dict[str, StratumTable]:
@@ -419,8 +419,8 @@ def compare(names: tuple[str, str], trials: ComparedTrials, verdict: Verdict | N
 def _described(comparison: Comparison, evidence: str) -> Comparison:
     """Return an open comparison without its tests, evidence and letters: those fields become None or {}.
 
-    Descriptive statistics remain. If the plan's design tests the outcome `evidence` by e-values, that statistic remains
-    too.
+    Descriptive statistics remain. `evidence` is the outcome ("success" or "score") that the plan's design tests by
+    e-values, or "" if it tests none. The evidence on that outcome remains too.
     """
     left = (
         name

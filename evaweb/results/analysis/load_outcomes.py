@@ -98,9 +98,9 @@ def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[
 def _milestones(
     trials: QuerySet[Trial], earlier: dict[int, tuple[int, dict[str, Any]]]
 ) -> dict[int, list[tuple[str, bool]]]:
-    """Return by score its milestones in order, each with whether it was reached.
+    """Return the milestones of each score, by the score's id: in order, each as text with whether it was reached.
 
-    If `earlier` is empty, only the current score of each trial is included; otherwise all its scores are.
+    If `earlier` is empty, only the current score of each trial is included, otherwise all scores of each trial.
     """
     counting = (
         MilestoneOutcome.objects.filter(score__trial__in=trials)

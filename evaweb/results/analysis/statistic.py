@@ -111,7 +111,7 @@ def write_all(found: Any) -> dict[str, Any]:
 
 
 def answer_all(found: Any, context: Any) -> Iterator[tuple[str, Answer]]:
-    """Yield the answers of a comparison by rank, each with the name of its statistic."""
+    """Yield all answers of a comparison, each with the name of its statistic, in the order of the statistics' ranks."""
     for name, row in sorted(statistics_of(type(found)).items(), key=lambda item: item[1].rank):
         value = getattr(found, name)
         if value is not None or row.none_too:

@@ -192,7 +192,10 @@ class Citation:
         return [self._of_pairs(i, name) for i, name in enumerate(arms_of(compared(self.plan.document or {})))]
 
     def _of_pairs(self, i: int, name: str) -> CitedRow:
-        """Return the row of a checkpoint from a reveal that recorded only the pairs."""
+        """Return the table's row of checkpoint `name`, computed from the blocks of trials in which it is arm `i`.
+
+        This is for a plan whose reveal recorded only the pairs, and not the values of the rows.
+        """
         values = [value for block in self.blocks for arm, value in block if arm == i]
         n = len(values)
         if self.found.outcome != SUCCESS:

@@ -86,10 +86,10 @@ def _facts(result: PlanResult, comparison: Comparison, own: str) -> Iterator[Com
 
 
 def _own_interval(plan: Plan) -> str:
-    """Return the name of the statistic that is the interval of the plan's design.
+    """Return the name of the statistic that is the interval of the plan's design, "" if there is no such statistic.
 
-    Return "" if none of a comparison's statistics is: for a design with a boundary, the estimate is shown below the
-    headline instead.
+    There is none for a design with a boundary, because its estimate is shown below the headline instead, and none for a
+    fixed design that compares scores.
     """
     by_score = (plan.document or {}).get("stopping", {}).get("outcome") == PrimaryOutcome.SCORE
     if plan.stopping == StoppingRule.EVIDENCE:

@@ -380,7 +380,10 @@ def conclude_alone(
 
 
 def _versions(plan: Plan) -> tuple[str, ...]:
-    """Return the headline of each earlier version, newest first: each had its own full alpha."""
+    """Return the headline of each earlier version of the plan, newest first, and why that version was amended.
+
+    These headlines are shown as a caveat, because each version used its own full alpha.
+    """
     sentences, version = [], plan.amends
     while version is not None:
         design = frozen_design(version.document) if version.document else None

@@ -92,7 +92,10 @@ def rows_of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
 
 @register.simple_tag
 def closed_because(plan: Plan, sealed: bool) -> str:
-    """Return the reason for which the plan was closed; of a `sealed` plan only what the reader may know."""
+    """Return the reason for which the plan was closed.
+
+    If the plan is `sealed` for the reader, return only what that reader may know.
+    """
     return visible_close_reason(plan, sealed)
 
 

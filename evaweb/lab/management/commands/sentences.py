@@ -1,4 +1,4 @@
-"""manage.py sentences [FILE]: the catalogue for a translator, or what a language lacks."""
+"""manage.py sentences [FILE]: print all sentences for a translator, or what the file of a language lacks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Command(BaseCommand):
         )
 
     def handle(self, *args: Any, file: Path | None = None, **options: Any) -> None:
-        """Print the catalogue, or compare a language with it."""
+        """Print all sentences, or how the file of a language differs from them."""
         entries = {
             "sentences": sentences.once(
                 [*sentences.of_python(), *sentences.of_labels(), *sentences.of_scripts()]

@@ -283,7 +283,10 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
 
 
 def _stood(scores: Rows, at: str) -> dict[str, str]:
-    """Return the last score given at or before `at`; the first score if a clock set back puts all of them later."""
+    """Return the last score given at or before `at`.
+
+    If the clock was set back, so that all scores seem to be later, return the first score.
+    """
     then = datetime.fromisoformat(at)
     return next(
         (score for score in reversed(scores) if datetime.fromisoformat(score["scored_at"]) <= then), scores[0]

@@ -309,10 +309,10 @@ def _sum(blocks: Sequence[tuple[list[float], list[float]]], side: int) -> tuple[
 
 
 def error(plan: Mapping[str, Any]) -> float:
-    """Return an upper bound of the probability that the boundary stops wrongly; with a margin the maximum over 400
-    rates.
+    """Return an upper bound of the probability that the boundary stops wrongly.
 
-    All orders of outcomes that lead to a table are equally likely, and their number is counted exactly.
+    For a design with a margin, it is the maximum over 400 rates. All orders of outcomes that lead to a table are
+    equally likely, and their number is counted exactly.
     """
     stopping = plan["stopping"]
     margin, alpha = stopping.get("margin"), share_of(plan)
@@ -405,14 +405,14 @@ Tables = dict[tuple[int, int], int]  # successes of both arms: number of orders 
 
 
 def _stopped(boundary: Sequence[Sequence[int]], margin: float | None) -> Iterator[tuple[int, int, Tables]]:
-    """Yield the trials of each look, and the tables that stop there."""
+    """Yield, for each look of the boundary, the trials of both arms and the tables that end the comparison there."""
     yield from ((n, m, gone) for n, m, gone, _ in _walked(boundary, margin))
 
 
 def _walked(
     boundary: Sequence[Sequence[int]], margin: float | None
 ) -> Iterator[tuple[int, int, Tables, Tables]]:
-    """Yield the trials of each look, the tables that stop there, and those that continue."""
+    """Yield, for each look, the trials of both arms, the tables that end the comparison, and the other tables."""
     alive, n, m = {(0, 0): 1}, 0, 0
     for limit in boundary:
         for arm in (0,) * (limit[0] - n) + (1,) * (limit[1] - m):

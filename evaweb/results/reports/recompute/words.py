@@ -38,7 +38,7 @@ def headline_faults(
 
 
 def _ways(conclusion: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the possible beginnings of the headline's sentence on one comparison, with its counts."""
+    """Yield the possible beginnings of the headline's sentence on one comparison, including the counts."""
     first, second, stopping = conclusion["first"], conclusion["second"], plan["stopping"]
     if conclusion["at"] is None:
         yield f"{first} and {second} were not compared: closed after {conclusion['blocks']} of "
@@ -74,7 +74,10 @@ def _unit(plan: Mapping[str, Any]) -> str:
 
 
 def _best(conclusions: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
-    """Return the beginning of the headline's sentence on the best of all checkpoints; "" if it must not have one."""
+    """Return the beginning of the headline's sentence on the best of all checkpoints.
+
+    Return "" if the headline must not have such a sentence.
+    """
     arms, stopping = arms_of(plan), plan["stopping"]
     of_all = len(arms) > 2 and 2 * len(conclusions) == len(arms) * (len(arms) - 1)
     differ = stopping.get("outcome") == "score" and any(
