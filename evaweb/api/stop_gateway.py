@@ -190,7 +190,10 @@ def stop_application(web_port: int) -> StopGateway:
 
 
 async def _answered(scope: dict[str, Any], station: str, action: str, body: bytes) -> Answered | None:
-    """Return status and answer; None for a command that is not a stop."""
+    """Carry out a stopping command, and return the HTTP status and the answer.
+
+    Return None for a command that is no e-stop, stop or halt.
+    """
     if action == "estop":
         return await _estop(scope, station, _parse_body(body))
     press = pressing.parse_json_press(body, "kind")
@@ -341,9 +344,10 @@ def _replay_body(body: bytes, receive: _Receive) -> _Receive:
 
 
 def _is_known(host: str) -> bool:
-    """Return True if `host` is a name of the lab; pages of other names that lead here are not ours.
+    """Return True if `host` is a name of this lab.
 
-    An e-stop is never refused because of the host name.
+    A request with another host name may come from a page of someone else whose domain leads to this server. An e-stop
+    is never refused because of the host name.
     """
     return validate_host(split_domain_port(host)[0], settings.ALLOWED_HOSTS)
 

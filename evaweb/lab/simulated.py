@@ -30,8 +30,12 @@ POLICIES = {
 
 @dataclass(frozen=True)
 class Benches:
-    """Settings of this lab's simulated benches: seed of the first layout, image size [pixels], overrides of
-    their stations.
+    """Settings of this lab's simulated benches.
+
+    Attributes:
+        seed: Seed of the first layout.
+        pictures: Width and height of the camera images [pixels].
+        assignments: Assignments KEY=VALUE that override settings in the deployments of the benches' stations.
     """
 
     seed: int = 1

@@ -203,7 +203,10 @@ def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
 
 
 def _require_unjudged(reference: Reference) -> None:
-    """Raise Conflict if a running plan has used the camera's reference as a gate, which must not change."""
+    """Raise Conflict if the reference may not be replaced, because it has already served as a gate in a running plan.
+
+    The trials of a running plan must all be judged by the same reference of a camera.
+    """
     judged = Achieved.objects.filter(
         reference__station=reference.station_id,
         reference__position=reference.position_id,
@@ -314,7 +317,8 @@ def _require_match(trial: Trial, matches: Sequence[CameraMatch], reason: str) ->
 def _check_before(action: str, trial: Trial, user: Any) -> None:
     """Check an action on a plan's trial (see `register_check`).
 
-    Within a transaction the plan is locked until its end, so that it cannot be revealed between check and action.
+    Within a transaction the plan is locked until the transaction ends, so that it cannot be revealed between the check
+    and the action.
     """
     rows = Handout.objects.select_related("plan", "trial")
     if transaction.get_connection().in_atomic_block:

@@ -88,8 +88,7 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
     """Set the draft's fields to `values`.
 
     The positions, stations and checkpoints are saved here. The caller must save the other fields. The draft keeps those
-    of
-    its checkpoints whose ids are in `hidden`, because `values` cannot contain them.
+    of its checkpoints whose ids are in `hidden`, because `values` cannot contain them.
     """
     roles = _roles(plan)  # read before the change: their meaning depends on `comparing`
     for name in values.keys() & set(_PLAIN):

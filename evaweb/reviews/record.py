@@ -45,7 +45,7 @@ class ReviewLine(Line):
 
 
 class SegmentLine(Line):
-    """Journal line of a segment, as it is from then on."""
+    """Journal line with the values of a segment, valid until a later line of the same segment."""
 
     kind: Literal["segment"] = "segment"
     uuid: UUID
@@ -97,7 +97,10 @@ REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, Remova
 
 
 def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
-    """Return the tags that are left after all lines; of two tags with the same words the first."""
+    """Return the tags of an episode after all lines have been applied.
+
+    Of two tags with the same words, only the first is returned.
+    """
     by_uuid: dict[UUID, TagLine] = {}
     for line in lines:
         if isinstance(line, TagLine):

@@ -64,8 +64,7 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
     """Update the episode's rows of segments from its lines; return the number of changed rows.
 
     Each row gets the values of its segment's newest line, and rows of segments without a line are deleted. If lines
-    were
-    skipped (`whole` is False), rows are only added, because the missing lines may have changed other rows.
+    were skipped (`whole` is False), rows are only added, because the missing lines may have changed other rows.
     """
     by_uuid = {line.uuid: line for line in segments_of(lines)}
     changed = 0

@@ -312,8 +312,7 @@ def _stored_row(row: Command) -> Command:
     """Store the row of a command, and return the stored row.
 
     If a row with the same uuid exists, that first row is returned. An answer or a user that the first row lacks is
-    copied
-    to it. An e-stop press whose uuid belongs to another command gets its own row.
+    copied to it. An e-stop press whose uuid belongs to another command gets its own row.
     """
     _resolve(row)
     try:
@@ -341,8 +340,7 @@ def _merged_fields(row: Command, first: Command) -> list[str]:
 
     `row` is a record of the same stop as `first`, and arrived on another path. The fields of the answer are included in
     three cases: `first` has no answer; only the answer in `row` says that the stop was carried out; or only the answer
-    in
-    `row` says that this press latched the stop. The fields `user` and `args` are included if only `row` has a user.
+    in `row` says that this press latched the stop. The fields `user` and `args` are included if only `row` has a user.
     """
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"

@@ -115,8 +115,7 @@ def _sentences(snapshot: Mapping[str, Any], redacted: Mapping[str, Any]) -> dict
     """Return the references to sentences (id and arguments) whose text is the same in the redacted snapshot.
 
     A page uses such a reference to translate the text. A reference is left out if its arguments contain anything that
-    the
-    text does not show.
+    the text does not show.
     """
     before, now = texts(snapshot), texts(redacted)
     return {
@@ -140,10 +139,11 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
 def redact_events(
     rows: Iterable[Mapping[str, Any]], sight: Visibility, last: int = 0
 ) -> list[dict[str, Any]]:
-    """Return the events that reveal no policy.
+    """Return the events that reveal no policy, with new numbers.
 
-    The events get new numbers, which are their times [us], increasing from `last`, so that neither the number nor the
-    times of hidden events can be inferred from gaps.
+    The new number of an event is its time [us], or the previous number plus 1 if that is larger; the first number is
+    above `last`. The original numbers would have gaps, from which the number and the times of hidden events could be
+    inferred.
     """
     events = []
     for row in rows:

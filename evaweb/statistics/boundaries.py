@@ -421,8 +421,7 @@ def _within(
 
     This function is for a design that tests whether both rates are equal. The tables are ordered from the most extreme
     downwards. The last table that joins must be at one of the indices in `ends`. The error grows with the number of
-    tables
-    at every rate, so the number is found by bisection.
+    tables at every rate, so the number is found by bisection.
 
     Args:
         null: Null hypothesis, with the grid of common rates.

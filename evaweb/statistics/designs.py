@@ -328,8 +328,7 @@ def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]
     """Return the blocks up to the first incomplete one, which is not returned.
 
     A block is incomplete if it lacks an arm that was still in use. `dropped` maps each dropped arm to the number of
-    blocks
-    after which it was dropped.
+    blocks after which it was dropped.
     """
     complete = []
     for number, block in enumerate(blocks):
@@ -396,8 +395,7 @@ def _succeeded(blocks: Sequence[Sides]) -> tuple[float, float]:
     """Return the p-value of a design with one test after a fixed number of blocks, and the difference of the rates.
 
     The difference is the first arm's success rate minus the second's. Without trials of an arm, the p-value is 1 and
-    the
-    difference is 0.
+    the difference is 0.
     """
     (first, n), (second, m) = (_sum(blocks, side) for side in (0, 1))
     if not n or not m:
@@ -480,8 +478,7 @@ def boundary_table(found: Boundary) -> list[list[int]]:
     """Return the boundary as JSON, with one list of integers per look.
 
     A list has the trials of the first and the second arm. If a table can stop at this look, the successes of both arms
-    in
-    the least extreme such table follow.
+    in the least extreme such table follow.
     """
     return [[table.first, table.second, *(table.least or ())] for table in found.looks]
 

@@ -43,8 +43,7 @@ class Comparison:
     """Comparison of two runs; `first` was run or shown first.
 
     If several people compared the same two runs, each of these comparisons gets a `weight` below 1, so that together
-    they
-    count as one comparison.
+    they count as one comparison.
     """
 
     first: str

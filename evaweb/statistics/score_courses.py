@@ -133,7 +133,10 @@ def _differences(scores: Scores) -> NDArray[Any]:
 
 
 def _flipped(differences: NDArray[Any], points: int) -> NDArray[Any]:
-    """Return the two-sided p of each row [rows, pairs] by the permutation test, all signs counted."""
+    """Return the two-sided p-value of the sign-flip test for each row of `differences` [rows, pairs].
+
+    The differences are integers from -points to `points`. The test is exact: all combinations of signs are counted.
+    """
     import numpy as np
 
     sizes = np.abs(differences)

@@ -158,8 +158,9 @@ def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Tri
 def _transition_for(state: str, unbegun: Mapping[str, Any]) -> Transition:
     """Return the transition of a trial whose station is now in `state`.
 
-    `unbegun` is the station's report of a run that never began, {} otherwise. Such a run is not an attempt if no
-    recording was opened: the trial is prepared again. Otherwise the trial is interrupted and has to be repeated.
+    `unbegun` is the station's report of a run that never began, {} if there is no such report. If no recording was
+    opened for the run, the run does not count as an attempt, and the trial is prepared again. If a recording was
+    opened, the trial is interrupted and has to be repeated.
     """
     if unbegun:
         return Transition.GIVE_BACK if unbegun.get("unopened") else Transition.INTERRUPT

@@ -93,8 +93,7 @@ class FileCopies:
         """Copy a folder and return its files.
 
         The copy is repeated until the folder does not change while it is copied. If the folder changes during every
-        try, it
-        is added to `changing`, and the last copy is kept.
+        try, it is added to `changing`, and the last copy is kept.
         """
         for _ in range(_TRIES):
             names = list(self._walk(unit))

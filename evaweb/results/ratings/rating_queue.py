@@ -160,8 +160,7 @@ def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, 
     """Return the next item to rate: the first with all images, else the first whose images may still arrive.
 
     The result also names, as `passed`, the codes of the trials without images that were skipped on the way. `waiting`
-    is
-    read no further than necessary.
+    is read no further than necessary.
 
     Args:
         waiting: Items that wait for a rating, in order.

@@ -24,7 +24,10 @@ _JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE = Pattern(
 
 @register_restorer
 def restore(kept: RestorableRun) -> int:
-    """Create the missing rows and return their number; the trials must have been restored before."""
+    """Create the missing rows of ratings, preferences and judgements from the lines of a run; return their number.
+
+    The trials must have been restored before.
+    """
     count = 0
     for line in kept.lines:
         try:
