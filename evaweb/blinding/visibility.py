@@ -150,7 +150,10 @@ class Visibility:
         )
 
     def require_episode(self, episode: Any) -> None:
-        """Raise NotAllowed if the recording's policy is hidden; for parts that reveal it."""
+        """Raise NotAllowed if the checkpoint that made the recording is hidden from the user.
+
+        Call this before returning a part of the recording that would reveal the checkpoint.
+        """
         if self.hides_episode(episode):
             raise NotAllowed(f"this part of the recording tells which checkpoint it is of: {self.plans}")
 

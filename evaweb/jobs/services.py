@@ -230,7 +230,11 @@ def heartbeat(*, job: Job) -> bool:
 
 
 def job_done(*, job: Job, result: Args) -> bool:
-    """Record the result; return False if the job was reclaimed meanwhile, and its new owner records the outcome."""
+    """Record the result of the job, and return True.
+
+    If another worker has reclaimed the job meanwhile, the result is dropped and False is returned: the new owner of the
+    job records its outcome.
+    """
     finished = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
     if finished:
         log.info("job %s is done: %s", job.key, dict(result))

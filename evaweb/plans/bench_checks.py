@@ -222,7 +222,11 @@ def allocate_checked_trial(*, user: User, station: Station, plan: Plan) -> Hando
 
 @dataclass(frozen=True, slots=True)
 class CameraMatch:
-    """Current image of a camera; `match` and `regions` as in Achieved, None and [] without a reference."""
+    """Current image of a camera, compared with its reference picture.
+
+    `match` and `regions` have the same meaning as in `Achieved`. Without a reference picture, `match` is None and
+    `regions` is empty.
+    """
 
     camera: str
     jpeg: bytes
@@ -344,9 +348,10 @@ def _repeated(handout: Handout) -> bool:
 
 
 def _of_two(trial: Trial) -> bool:
-    """Return True if two operators must agree to a void: in a blind plan, or if the plan counts the trial as a failure.
+    """Return True if two operators must agree before the trial is voided.
 
-    Otherwise an unwelcome trial could be repeated instead.
+    This is so if the trial is of a blind plan, or if the plan counts it as a failure. Otherwise a single operator could
+    void an unwelcome trial in order to have it repeated.
     """
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     return handout is not None and (handout.plan.blind or fails_by(handout.plan, trial))

@@ -144,7 +144,10 @@ class Line(BaseModel):
         )
 
     def to_row_values(self) -> dict[str, Any]:
-        """Return the values of the row, with people as accounts; values stored in other rows are omitted."""
+        """Return the values of the database row.
+
+        Usernames are replaced by their accounts. Values that are stored in other rows are omitted.
+        """
         values = {}
         for name in type(self).names():
             field, _, further = type(self).path_of(name).partition("__")

@@ -31,7 +31,10 @@ AT_ONCE = 20  # jobs queued per call of a periodic task
 
 @job_kind("quality")
 def quality(work: JobContext) -> Mapping[str, Any]:
-    """Check an episode and store the report; args: uuid."""
+    """Check the quality of an episode and store the report.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     # Imported late: web processes import this module but never run the job.
     from runtime.quality.settings import QualitySettings, read_settings
 
@@ -71,7 +74,10 @@ def _inspected(episode: Episode, settings: QualitySettings) -> Report:
 
 @job_kind("sides")
 def write_sidecars_job(work: JobContext) -> Mapping[str, Any]:
-    """Attach reviews and annotations to the published episode; args: uuid."""
+    """Attach reviews and annotations to the published episode.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     if episode.dataset_index is None:
         return {"attached": False, "why": "it is in no dataset"}

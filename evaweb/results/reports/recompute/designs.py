@@ -327,7 +327,7 @@ def error(plan: Mapping[str, Any]) -> float:
 
 
 def share_of(plan: Mapping[str, Any]) -> float:
-    """Return alpha of each comparison."""
+    """Return the error probability of a single comparison: alpha divided by the number of comparisons."""
     return float(plan["stopping"]["alpha"]) / max(1, len(comparisons_of(plan)))
 
 

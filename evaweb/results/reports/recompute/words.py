@@ -1,4 +1,4 @@
-"""Statements of the report's page and headline, compared with the numbers."""
+"""Check of the sentences in the report's headline and on its page against the recomputed numbers."""
 
 from __future__ import annotations
 
