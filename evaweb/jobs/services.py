@@ -321,7 +321,10 @@ def _reclaim(job: Job) -> bool:
 
 
 def requeue(*, owner: UUID) -> int:
-    """Requeue the running jobs of a worker that is shutting down, without counting a death; return their number."""
+    """Requeue the running jobs of a worker that is shutting down, and return their number.
+
+    The end of this worker is not counted as one of the deaths after which a job fails.
+    """
     mine = Job.objects.filter(status=JobStatus.RUNNING, owner=owner)
     return sum(_requeue_row(_ours(job)) for job in mine)
 

@@ -236,7 +236,10 @@ class CameraMatch:
 
     @property
     def worst(self) -> tuple[float, str] | None:
-        """Lowest match, which the gate tests, and its description; None without a reference."""
+        """Lowest match of the camera's regions or image, and its description; None without a reference.
+
+        This is the match that is compared with the least match that the plan requires, if the plan has a match gate.
+        """
         if self.regions:
             row = min(self.regions, key=lambda row: float(row["match"]))
             return row["match"], f"{self.camera}, {row['name']} {row['match']:.2f} ({row['words']})"

@@ -382,8 +382,8 @@ def register_reveal_data(told: Callable[[Plan], dict[str, Any]]) -> None:
 def reveal_record(plan: Plan) -> dict[str, Any] | None:
     """Return the data stored at a reveal, with their digest: blocks that count, sums per checkpoint, registered data.
 
-    Because the data are stored, later corrections do not change the plan's headline. None for a plan without a
-    comparison before format 7.
+    Because the data are stored, later corrections do not change the plan's headline. The result is None for a plan that
+    has no comparison and whose document has a format before 7.
     """
     document = plan.document or {}
     if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:

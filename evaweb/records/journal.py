@@ -68,9 +68,9 @@ def clean_text(name: str, given: str, longest: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RowPath:
-    """Query path to the row's attribute that a field of a line holds, such as `rater__username`.
+    """Annotation of a line's field: the query path to the attribute of the row that has the field's value.
 
-    "" stands for the field's own name.
+    An example is `rater__username`. "" stands for the field's own name.
     """
 
     path: str

@@ -133,11 +133,11 @@ class AutomaticJudge(models.Model):
 
     @property
     def setup(self) -> Setup:
-        """Set-up from which its module builds the judge."""
+        """Set-up from which the judge is built by the module for its kind."""
         return Setup(self.address, self.model, self.key_variable, self.plain, self.patience_s)
 
     def clean(self) -> None:
-        """Check that its module can build a judge from this set-up."""
+        """Check that the module for the judge's kind can build a judge from this set-up."""
         try:
             build_judge(self.name, self.kind, self.setup)
         except EvaError as fault:

@@ -102,7 +102,10 @@ def find_unchecked_episodes() -> int:
 
 @periodic_task("reviews to be published")
 def find_outdated_sidecars() -> int:
-    """Queue updates of published episodes with newer reviews, or reviews older than the publication."""
+    """Queue updates of the sidecars of published episodes that lack the newest reviews.
+
+    A sidecar lacks them if a review changed after it was written, or if the episode was published after it was written.
+    """
     rows = list(selectors.outdated_episodes()[:AT_ONCE])
     for standing in rows:
         with transaction.atomic():

@@ -367,7 +367,10 @@ def _first_or_own(row: Command) -> Command | None:
 
 
 def _latched_again(row: Command, first: Command) -> bool:
-    """Return True if this press latched the e-stop anew, at another time than the first with its uuid."""
+    """Return True if the press `row` latched the e-stop anew, and not at the same time as `first` did.
+
+    `first` is the press that was recorded first with the same uuid.
+    """
     at = first.data.get("carried_out_at")
     return row.data.get("latched") == "anew" and at not in (None, row.data["carried_out_at"])
 

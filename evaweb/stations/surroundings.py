@@ -90,7 +90,11 @@ def _at_poses(drawn: DrawnRobot) -> list[list[Box]]:
 
 
 def _roots(drawn: DrawnRobot) -> list[Float64]:
-    """Return the positions of the roots of the robot's copies of its URDF, [3] each."""
+    """Return the positions [3] at which the arms are mounted, at the home pose.
+
+    A robot may consist of several copies of its URDF, for example one per arm. Each copy has a root link, whose
+    position is returned.
+    """
     root = urdf.read(drawn.robot.urdf).root
     poses = drawn.scene.poses(drawn.robot.poses["home"])
     return [poses[part, :3, 3] for part in drawn.scene.parts_showing(root)]

@@ -147,10 +147,9 @@ def design(
     block.
 
     Raises:
-        StatisticsError: The combination is not allowed: a margin with a rule that allows no margin, looks with a rule
-        that
-            allows no looks, an exact boundary with more than 250 trials per arm, or arms in random order with scores or
-            an e-process.
+        StatisticsError: If the combination is not allowed: a margin with a rule that allows no margin, looks with a
+            rule that allows no looks, an exact boundary with more than 250 trials per arm, or arms in random order with
+            scores or an e-process.
     """
     check_design(
         rule=rule,

@@ -122,7 +122,10 @@ def score_pairs_needed(rule: str, scores: Scores, power: float, alpha: float) ->
 
 @lru_cache(maxsize=8)
 def _differences(scores: Scores) -> NDArray[Any]:
-    """Return simulated score differences in points [runs, MOST]; the first columns are those of a smaller design."""
+    """Return simulated score differences in points: int8 [runs, MOST], one row per evaluation.
+
+    A design with fewer pairs than MOST uses the first columns.
+    """
     import numpy as np
 
     chance = np.random.default_rng(_SEED)

@@ -113,7 +113,7 @@ def count_successes(trials: Sequence[Outcome]) -> tuple[int, int]:
 
 
 def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
-    """Return the trials by key, sorted by it."""
+    """Return the trials by key, with the keys in ascending order."""
     groups: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in trials:
         groups[key(outcome)].append(outcome)

@@ -425,7 +425,10 @@ def _walked(
 
 
 def _mixed(share: Sequence[float], p: float) -> float:
-    """Return the mean of `share` over a binomial number of successes."""
+    """Return the mean of `share` [n + 1] if the number of successes is binomial with `n` trials and rate `p`.
+
+    `share` has one value for each number of successes, 0 to n.
+    """
     n = len(share) - 1
     middle = min(n, int(p * (n + 1)))
     at = math.exp(

@@ -151,7 +151,11 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
 
 
 def _highest(function: Callable[[float], float], low: float, high: float, parts: int) -> float:
-    """Return the maximum of a smooth function that may have several peaks."""
+    """Return the maximum of a smooth function between `low` and `high`.
+
+    The function may have several peaks. It is evaluated at `parts` equal steps, and the search is refined around the
+    three highest peaks.
+    """
     width = (high - low) / parts
     values = [function(low + i * width) for i in range(parts + 1)]
     best = max(values)

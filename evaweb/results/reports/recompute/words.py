@@ -143,7 +143,7 @@ def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
 
 
 def _cells(arm: Mapping[str, Any]) -> list[str]:
-    """Return the expected cells of a checkpoint's row that follow its letters."""
+    """Return the expected cells of a checkpoint's row in the table, from the cell that follows its letters."""
     rate = f"{arm['successes']}/{arm['n']}, {100 * arm['rate']:.0f} % [{_ends(arm['wilson'])}]"
     means = (
         f"{100 * arm[name]['value']:.0f} % [{_ends(arm[name]['gaffke'])}]" for name in ("score", "macro")
