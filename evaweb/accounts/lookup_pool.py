@@ -46,7 +46,7 @@ class FairLookupPool(Generic[T]):
         self._threads = ThreadPoolExecutor(threads, name, initializer=begin)
 
     def submit(self, share: Hashable, work: Callable[[], T]) -> Future[T]:
-        """Queue `work` in this share and return the future of its result."""
+        """Queue `work` in the queue of `share`, usually a client, and return the future of its result."""
         answer: Future[T] = Future()
         answer.set_running_or_notify_cancel()  # shared by callers: one must not cancel it for others
         with self._lock:
@@ -64,10 +64,11 @@ class FairLookupPool(Generic[T]):
         return answer
 
     def _place_for(self, share: Hashable, answer: Future[T]) -> Future[T] | None:
-        """Make room for one more piece of work if the pool is full, by removing the newest work of the longest queue.
+        """Make room for one more piece of work of `share`, and return the future that has to fail for it.
 
-        Returns: The future to fail: None if there was room, `answer` if that of `share` would be the longest queue,
-        else the future of the removed work.
+        If there is room already, no future has to fail: the result is None. If the pool is full, the newest work of the
+        longest queue is removed, and its future is returned. But if the new work would make the queue of `share` the
+        longest, nothing is removed: the new work is refused, and its future, `answer`, is returned.
         """
         if self._waiting < self._most:
             return None

@@ -11,7 +11,10 @@ class ApiConfig(AppConfig):
     verbose_name = "Tokens of programs"
 
     def ready(self) -> None:
-        """Connect the receiver of password changes, and name the app that counts failed logins."""
+        """Connect the receiver of password changes, and set the title of django-axes on the admin pages.
+
+        django-axes is the app that counts failed logins.
+        """
         from django.apps import apps
 
         from evaweb.api import tokens  # noqa: F401  its receiver

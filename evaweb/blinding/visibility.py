@@ -135,7 +135,11 @@ class Visibility:
         return self.checkpoint_label(trial) if trial is not None else HIDDEN
 
     def tags_of(self, episode: Any) -> list[str]:
-        """Return the tags of a recording except hidden opinions of others and tags that name a hidden checkpoint."""
+        """Return the tags of a recording that this user may see.
+
+        Left out are tags by other people if this user may still have to judge the recording blind, and tags that name a
+        hidden checkpoint.
+        """
         tags = [tag for tag in episode.tags.all() if not self.hides_opinion(episode, tag.by_id)]
         return [tag.words for tag in tags if not self.named_in(tag.words)]
 
@@ -150,7 +154,10 @@ class Visibility:
         )
 
     def require_episode(self, episode: Any) -> None:
-        """Raise NotAllowed if the recording's policy is hidden; for parts that reveal it."""
+        """Raise NotAllowed if the checkpoint that made the recording is hidden from the user.
+
+        Call this before returning a part of the recording that would reveal the checkpoint.
+        """
         if self.hides_episode(episode):
             raise NotAllowed(f"this part of the recording tells which checkpoint it is of: {self.plans}")
 

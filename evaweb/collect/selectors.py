@@ -31,7 +31,15 @@ PUBLISHED_RESULTS = (Result.SUCCESS.value, Result.PARTIAL.value)
 class Counts:
     """Numbers of a session's episodes.
 
-    `saved` (complete, not discarded) are counted in all and by result; `cut` are incomplete, not discarded episodes.
+    Attributes:
+        saved: Complete episodes with at least one row that are not discarded, whatever their result.
+        success: Saved episodes with this result.
+        partial: Saved episodes with this result.
+        fail: Saved episodes with this result.
+        unlabelled: Saved episodes without a result.
+        discarded: Discarded episodes.
+        cut: Incomplete episodes that are not discarded.
+        published: Episodes that are in a dataset.
     """
 
     saved: int

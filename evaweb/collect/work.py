@@ -40,7 +40,11 @@ class QueueItem:
 
 @dataclass(frozen=True, slots=True)
 class Queue:
-    """Failed, running and queued jobs, in this order; `left_s` is the total remaining time in succession [s]."""
+    """Unfinished jobs for a session's episodes: first failed, then running, then queued ones.
+
+    `done` is the number of jobs that are done. `left_s` is the total remaining time [s] if the jobs run one after
+    another, None if it is unknown.
+    """
 
     items: tuple[QueueItem, ...]
     done: int
@@ -48,12 +52,12 @@ class Queue:
 
     @property
     def total(self) -> int:
-        """Number of jobs for these episodes, the newest of each kind."""
+        """Number of jobs, done or not, for the session's episodes: the newest of each kind for each episode."""
         return self.done + len(self.items)
 
     @property
     def active(self) -> bool:
-        """Whether a job is running or queued, so that a page polls."""
+        """Whether a job is running or queued. While this is so, the page has to poll."""
         return any(item.job.status != JobStatus.FAILED for item in self.items)
 
     @property

@@ -83,7 +83,11 @@ class ConnectionLimiter:
 
 
 class Request(BoundedRequest):
-    """Request that reports to its connection when it is complete, or may take longer, and when it was answered."""
+    """Request that tells its connection when the connection's limit has to end and to begin again.
+
+    The limit ends when the request is complete, or is admitted so that its body may take longer. It begins again when
+    the request has been answered.
+    """
 
     def admitted(self) -> None:
         self.channel.transport.sent()

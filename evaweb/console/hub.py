@@ -163,7 +163,7 @@ class StationRoom:
             self._covered.clear()
 
     def _refresh_visibility(self) -> None:
-        """Query the visibilities; events that arrived before wait for the answer."""
+        """Look up again what each viewer may see. Events that have already arrived are held back until then."""
         if self._looking is None and self._viewers:
             self._looking = self._loop.create_task(self._looked())
         else:

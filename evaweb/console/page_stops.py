@@ -1,7 +1,7 @@
-"""Stops by a page: executed at once if the user is known.
+"""Stops and e-stops requested by a page, executed at once if the page's user is known.
 
-If the user is not known yet, the credentials are resolved first; an e-stop is executed even if the database cannot do
-that. Once the user is known, nothing here waits for the database. The number of presses is not limited.
+If the user is not known yet, the credentials are looked up first. An e-stop is executed even if the database cannot be
+asked; a stop is not. Once the user is known, nothing here waits for the database. The number of presses is not limited.
 """
 
 from __future__ import annotations

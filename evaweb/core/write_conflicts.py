@@ -32,7 +32,11 @@ def is_duplicate(error: BaseException) -> bool:
 
 
 def once_more(write: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Decorate a transaction to run a second time if its name was taken: the second run then finds the other row."""
+    """Decorate a function that writes in a transaction, so that it runs a second time if its row exists already.
+
+    This happens when another process creates a row with the same unique value meanwhile. The second run then finds the
+    other row. Within an outer transaction nothing is repeated.
+    """
 
     @wraps(write)
     def written(*args: _Given.args, **kwargs: _Given.kwargs) -> _Found:

@@ -57,7 +57,12 @@ def list_rows(
 
 
 def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
-    """Return this program's own lines about the episodes of a dataset, by index; {} for a foreign dataset."""
+    """Return what this program wrote about each episode of a dataset, by index of the episode.
+
+    The result is {} for a dataset of another program.
+
+    Raises: RecordingError if a line names no episode.
+    """
     lines = layout.read_lines(dataset.root / layout.EVA_EPISODES)
     try:
         return {int(line["episode_index"]): line for line in lines}

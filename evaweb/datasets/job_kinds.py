@@ -19,9 +19,10 @@ _READ = ("check", "push")  # orders that change no dataset
 
 @job_kind(KIND, least=lambda args: least_for(args["what"]))
 def dataset(work: JobContext) -> Mapping[str, Any]:
-    """Execute an order; args: a checked order of evaweb.datasets.dataset_orders.
+    """Execute an order for datasets.
 
-    A refusal is a result (`done` False, `why`), because a retry would not change it.
+    The arguments of the job are a validated order of evaweb.datasets.dataset_orders. If the order is refused, the job
+    still succeeds, with the result `done` False and the reason in `why`, because a retry would not change it.
     """
     try:
         work.hold(_names(work.args))

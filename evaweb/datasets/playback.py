@@ -330,9 +330,10 @@ def _with_streams(episode: PlayedEpisode, path: Path, rows: Any) -> Episode:
 
 
 def _renamed(table: Any, new: Mapping[str, str], same: tuple[str, ...], numbers: tuple[str, ...]) -> Any:
-    """Return a table with the columns in `new` renamed, and those in `same` and `numbers` under their own names.
+    """Return a table of selected columns, some of them with new names.
 
-    In `numbers`, null becomes -1.
+    `new` maps the new name of a column to its present name. The columns in `same` and `numbers` keep their names. In
+    the columns of `numbers`, null becomes -1. All other columns are left out.
     """
     columns = {name: table[old] for name, old in new.items()} | {name: table[name] for name in same}
     return pa.table(columns | {name: table[name].fill_null(-1) for name in numbers})

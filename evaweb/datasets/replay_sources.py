@@ -83,7 +83,10 @@ def _of_dataset(name: str) -> ReplayEntry:
 
 
 def open_dataset_episode(name: str, index: int, robot: str = "") -> PlayedEpisode:
-    """Return an episode as `load_played_episode`. Raises: NotFound; Conflict if the dataset is unreadable."""
+    """Return episode `index` of a dataset, interpreted for `robot` if given.
+
+    Raises: NotFound; Conflict if the dataset is unreadable.
+    """
     try:
         return load_played_episode(name, index, robot)
     except RecordingError as error:

@@ -142,12 +142,12 @@ class ReplayOffer:
 
     @property
     def address(self) -> str:
-        """URL of the station's own page, on which it is set up and run."""
+        """URL of the page of the station on which the replay is set up and run."""
         return f"{reverse('station-debug', args=[self.station.name])}?{query(self.recorded, self.space)}"
 
 
 def query(recorded: PlayableEpisode, space: str) -> str:
-    """Return the query string that selects the episode and space."""
+    """Return the query string that selects the episode and the action space ("joint" or end-effector poses)."""
     return urlencode({"replay": recorded.source, "space": space, **_assumed(recorded)})
 
 

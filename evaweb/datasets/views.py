@@ -155,7 +155,10 @@ def _pairs(name: str, text: str) -> dict[str, str]:
 
 
 def _parts(text: str) -> dict[str, list[int]]:
-    """Parse the episodes of each part; the total is limited as in one order."""
+    """Parse the episode numbers of each part in the text of a split form.
+
+    Raises: EvaError if a part is malformed, or if all parts together have more episodes than one order may have.
+    """
     parts: dict[str, list[int]] = {}
     for part, which in _pairs("parts", text).items():
         try:

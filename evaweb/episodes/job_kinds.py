@@ -37,7 +37,10 @@ _AT_ONCE = 20  # jobs queued per call of a periodic task
 
 @job_kind("preview")
 def preview(work: JobContext) -> Mapping[str, Any]:
-    """Make the episode's preview; args: uuid."""
+    """Make the preview of the episode.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.report_progress)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
@@ -48,7 +51,10 @@ def preview(work: JobContext) -> Mapping[str, Any]:
 
 @job_kind("store")
 def store_videos(work: JobContext) -> Mapping[str, Any]:
-    """Move the videos of a preview to the lab's store, from which they are then played; args: uuid."""
+    """Move the videos of a preview to the lab's store, from which they are then played.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     return {"videos": put_videos(UUID(work.args["uuid"]))}
 
 
@@ -61,14 +67,20 @@ def store_at_start() -> None:
 
 @job_kind("export")
 def export_episode(work: JobContext) -> Mapping[str, Any]:
-    """Write the three action streams as one Parquet table, unless the station has written it; args: uuid."""
+    """Write the three action streams as one Parquet table, unless the station has written it.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     path = write_export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
 
 
 @job_kind("smoothness")
 def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
-    """Measure the smoothness of the robot's motion and store it, or the reason why it is unknown; args: uuid."""
+    """Measure the smoothness of the robot's motion and store it, or the reason why it is unknown.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     uuid = UUID(work.args["uuid"])
     try:
         smoothness = smoothness_in(journal_folder(uuid))
@@ -88,10 +100,10 @@ def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
 
 @job_kind("publish")
 def publish_episode(work: JobContext) -> Mapping[str, Any]:
-    """Write the episode into its dataset, with the success of its newest score.
+    """Write the episode into its dataset, labelled with the success in its newest score.
 
-    The args of the job are the `uuid` of the episode and the `version` of a new dataset. An interrupted episode is
-    published only if it was scored, a discarded one never.
+    The job has the argument `uuid`, the episode's, and optionally `version`, the format version if the dataset is new.
+    An interrupted episode is published only if it has a score. A discarded episode is never published.
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)

@@ -149,7 +149,11 @@ def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, proble
 
 
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:
-    """Pass every run to all restorers in order and return the number of restored rows."""
+    """Let each restorer, in its order, restore the missing rows of every run; return the number of restored rows.
+
+    `read` are the uuids of the episodes that could be read from disk. Runs that have only a file of scores are restored
+    too. Problems are appended to `problems`.
+    """
     files = {
         folder: _uuids_from_names(
             (data_dir() / folder).glob("*.jsonl"), ".jsonl", f"no file of {folder}", problems

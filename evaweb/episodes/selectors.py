@@ -166,7 +166,10 @@ def playback_stage(*, episode: Episode) -> PlaybackStage:
 
 
 def why_unrecorded(*, episode: Episode | None) -> str:
-    """Return why no recorded row proves that a run moved anything; "" if at least one row is recorded."""
+    """Return the reason why no row of the run was recorded; "" if at least one row was.
+
+    Without a recorded row, nothing proves that the run moved anything.
+    """
     if episode is None:
         return "nothing of its run was recorded"
     if episode.frames:

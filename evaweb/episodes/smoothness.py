@@ -118,10 +118,10 @@ class _Samples:
 
 @dataclass(frozen=True, slots=True)
 class _TipTrack:
-    """Positions of all end effectors [steps, arms, 3] at the control rate, one span per uninterrupted motion.
+    """Positions of all end effectors at the control rate.
 
-    The positions are linearly interpolated between samples. `seen` is the number of samples per second, None without
-    samples.
+    `spans` has one array [steps, arms, 3] for each uninterrupted motion. The positions are linearly interpolated
+    between samples. `seen` is the number of samples per second, None without samples.
     """
 
     spans: tuple[Array, ...]

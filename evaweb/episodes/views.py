@@ -101,7 +101,10 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def playback_stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Show the stage of an episode; make the page reload when it is ready."""
+    """Show how far an episode is on its way to playback, such as "preparing".
+
+    When it is "ready", the response makes the page reload.
+    """
     episode = episode_get(uuid=uuid)
     stage = selectors.playback_stage(episode=episode)
     answer = render(request, "episodes/stage.html", {"episode": episode, "stage": stage})

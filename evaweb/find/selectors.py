@@ -171,7 +171,11 @@ def _scenes(query: str, role: Role) -> Iterator[Candidate]:
 
 
 def _administered(kind: str, key: int, name: str, role: Role) -> str:
-    """Return the address of an item: that of its editor for administrators, of its recordings for other users."""
+    """Return the address of an item for a user of this role.
+
+    For administrators, it is the item's page in the administration. For other users, it is the list of the recordings
+    that match the item's name.
+    """
     if role is Role.ADMIN:
         return reverse(f"admin:trials_{kind}_change", args=[key])
     return f"{reverse('replay-list')}?{urlencode({'words': name})}"

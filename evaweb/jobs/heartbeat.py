@@ -67,9 +67,9 @@ class Heartbeat:
             connection.close()
 
     def _lapsing(self) -> threading.Timer:
-        """Return a timer that runs the lapse; it is started only if there is a lapse.
+        """Return a timer that runs the action of `lapse` when its time is over; without a lapse, it is not started.
 
-        It is a thread of its own, so that a hanging database cannot delay it.
+        The timer is a thread of its own, so that a hanging database cannot delay it.
         """
         lapse = self._lapse or Lapse(0.0, lambda: None)
         timer = threading.Timer(lapse.after_s, lapse.then)

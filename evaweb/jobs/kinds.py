@@ -96,7 +96,7 @@ def job_kind(
 
 
 def least_role(name: str, args: Args) -> Role:
-    """Return the lowest role that may request such a job."""
+    """Return the lowest role that may request a job of kind `name` with the arguments `args`."""
     return declared(name).least(args) if name in _kinds else Role.OPERATOR
 
 

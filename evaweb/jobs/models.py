@@ -81,7 +81,10 @@ class WorkerProcess(models.Model):
 
 
 class LabFolder(models.Model):
-    """Data folder of the lab, by its `lab_id`: one row, written by the processes that serve the web."""
+    """Record of which data folder is the lab's: its `lab_id`, computer and path.
+
+    The table has only one row. It is written by the processes that serve the web.
+    """
 
     lab_id = models.CharField(max_length=32)
     host = models.CharField(max_length=255)

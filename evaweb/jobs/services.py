@@ -238,7 +238,11 @@ def heartbeat(*, job: Job) -> bool:
 
 
 def job_done(*, job: Job, result: Args) -> bool:
-    """Record the result; return False if the job was reclaimed meanwhile, and its new owner records the outcome."""
+    """Record the result of the job, and return True.
+
+    If another worker has reclaimed the job meanwhile, the result is dropped and False is returned: the new owner of the
+    job records its outcome.
+    """
     finished = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
     if finished:
         log.info("job %s is done: %s", job.key, dict(result))
@@ -328,7 +332,10 @@ def _reclaim(job: Job) -> bool:
 
 
 def requeue(*, owner: UUID) -> int:
-    """Requeue the running jobs of a worker that is shutting down, without counting a death; return their number."""
+    """Requeue the running jobs of a worker that is shutting down, and return their number.
+
+    The end of this worker is not counted as one of the deaths after which a job fails.
+    """
     mine = Job.objects.filter(status=JobStatus.RUNNING, owner=owner)
     return sum(_requeue_row(_ours(job)) for job in mine)
 

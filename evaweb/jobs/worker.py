@@ -29,7 +29,8 @@ BROKER_AGAIN_S = 30.0
 def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
     """Execute jobs until SIGTERM, SIGINT or, with `lifeline`, the end of standard input.
 
-    A running job is finished then, or requeued after EVA_WORKER_GRACE_S [s].
+    A job that is running at that moment may still finish. If it takes longer than EVA_WORKER_GRACE_S [s], it is
+    requeued, and this process exits.
     """
     os.nice(settings.EVA_WORKER_NICE)
     ending = _ending_by_signal()

@@ -98,7 +98,13 @@ class StoredDeployment:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Status of a deployment in the lab: what is being started, whether it is up, or why it failed."""
+    """Status of a deployment in this lab.
+
+    Attributes:
+        doing: What is being started at the moment, "" if nothing is.
+        up: Whether the station is running.
+        failed: Why the start failed, "" if it did not.
+    """
 
     doing: str = ""
     up: bool = False

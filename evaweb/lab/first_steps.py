@@ -53,11 +53,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Walk:
-    """First steps of one station.
+    """First steps of one station, each of them done or not.
 
-    Without a station they are those of a lab in which the first step is the current one. `snapshot` is the station's
-    state, {} if the station does not answer; `kept` is its deployment file, and `standing` the status of that
-    deployment in the lab.
+    If there is neither a station nor a deployment, the first step is the current one.
+
+    Attributes:
+        station: The station; None if its row does not exist yet.
+        kept: The station's deployment file.
+        standing: Status of this deployment in the lab.
+        snapshot: State of the station, {} if it does not answer.
     """
 
     station: Station | None

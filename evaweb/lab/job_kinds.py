@@ -15,7 +15,10 @@ _KEPT = 3  # bundles per user
 
 @job_kind("diagnose", least=lambda args: Role.ADMIN)
 def diagnose(work: JobContext) -> Mapping[str, Any]:
-    """Write a bundle with the user's visibility; args: user, name."""
+    """Write a diagnostic bundle that contains what the user may see.
+
+    The job has two arguments: `user`, the id of the account, and `name`, the file name of the bundle.
+    """
     from evaweb.lab.diagnosis import (
         bundle,
     )  # imported here: the web knows this kind of job too, but never runs it

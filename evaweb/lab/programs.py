@@ -118,7 +118,7 @@ def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tup
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
     """Return the program that serves a scripted policy on `port`.
 
-    With 0 it picks a free port, and uses the same port after a restart.
+    If `port` is 0, the program picks a free port when it is first started. After a restart it uses the same port again.
     """
 
     def arguments(port: object) -> tuple[str, ...]:

@@ -145,8 +145,11 @@ def _url_of(name: str) -> str:
 
 
 def _pixels(text: str) -> tuple[int, int]:
-    """Return width and height of "400x300", the smallest size at which the scripted policies always detect
-    the block.
+    """Parse the size of images, such as "640x480", and return (width, height).
+
+    Sizes below 400x300 are refused: that is the smallest size at which the scripted policies always detect the block.
+
+    Raises: ArgumentTypeError for any other text.
     """
     match = re.fullmatch(r"(\d{3,4})x(\d{3,4})", text)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)

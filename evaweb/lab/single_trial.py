@@ -1,4 +1,7 @@
-"""Single trial from preparation to dataset, as by an operator, scored by the bench's ground truth."""
+"""A single trial, from its preparation to the dataset, made as an operator would make it.
+
+The trial is scored by the ground truth of the simulated bench.
+"""
 
 from __future__ import annotations
 

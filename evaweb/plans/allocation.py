@@ -197,9 +197,9 @@ def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
 
 
 def _with_newest(slots):  # type: ignore[no-untyped-def]
-    """Annotate slots with `newest`, the status of a trial.
+    """Annotate slots with `newest`, the status of the newest relevant trial of each slot.
 
-    It is the trial that counts, otherwise the newest attempt; None before any attempt.
+    This is the trial that counts or, if none does, the newest attempt. `newest` is None before any attempt.
     """
     counts = Case(When(trial__status=TrialStatus.SCORED, then=0), default=1)
     attempts = Handout.objects.filter(slot=OuterRef("pk")).order_by(counts, "-number")

@@ -232,7 +232,11 @@ def allocate_checked_trial(*, user: User, station: Station, plan: Plan) -> Hando
 
 @dataclass(frozen=True, slots=True)
 class CameraMatch:
-    """Current image of a camera; `match` and `regions` as in Achieved, None and [] without a reference."""
+    """Current image of a camera, compared with its reference picture.
+
+    `match` and `regions` have the same meaning as in `Achieved`. Without a reference picture, `match` is None and
+    `regions` is empty.
+    """
 
     camera: str
     jpeg: bytes
@@ -242,7 +246,10 @@ class CameraMatch:
 
     @property
     def worst(self) -> tuple[float, str] | None:
-        """Lowest match, which the gate tests, and its description; None without a reference."""
+        """Lowest match of the camera's regions or image, and its description; None without a reference.
+
+        This is the match that is compared with the least match that the plan requires, if the plan has a match gate.
+        """
         if self.regions:
             row = min(self.regions, key=lambda row: float(row["match"]))
             return row["match"], f"{self.camera}, {row['name']} {row['match']:.2f} ({row['words']})"
@@ -355,9 +362,10 @@ def _repeated(handout: Handout) -> bool:
 
 
 def _of_two(trial: Trial) -> bool:
-    """Return True if two operators must agree to a void: in a blind plan, or if the plan counts the trial as a failure.
+    """Return True if two operators must agree before the trial is voided.
 
-    Otherwise an unwelcome trial could be repeated instead.
+    This is so if the trial is of a blind plan, or if the plan counts it as a failure. Otherwise a single operator could
+    void an unwelcome trial in order to have it repeated.
     """
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     return handout is not None and (handout.plan.blind or fails_by(handout.plan, trial))

@@ -37,9 +37,10 @@ def draw_codes(key: bytes, count: int) -> list[str]:
 
 
 def make_commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
-    """Return the commitment: HMAC-SHA-256, by the key, of the plan's and the schedule's digest, in hexadecimal.
+    """Return the commitment in hexadecimal: the HMAC-SHA-256, with `key`, of the digests of plan and schedule.
 
-    With a key of 256 bits it reveals nothing about the schedule, and no other schedule matches it.
+    `plan` is the digest of the plan. With a key of 256 bits the commitment reveals nothing about the schedule, and no
+    other schedule matches it.
     """
     if len(key) != KEY_BYTES:
         raise EvaError(_KEY_BYTES_ALLOWED(count=len(key), key_bytes=KEY_BYTES))

@@ -73,7 +73,10 @@ def fails_by(plan: Plan, trial: Trial) -> bool:
 
 
 def declared_failures(plan: Plan) -> dict[int, str]:
-    """Return the scored trials that are failures by the plan, with the cause of their end as text."""
+    """Return the scored trials that count as failures by the plan's rules, because of how their runs ended.
+
+    The dict maps the id of each of these trials to the text of what ended its run.
+    """
     if all(getattr(plan, name) != CountsAs.FAILURE for name in ENDS):
         return {}
     rows = Trial.objects.filter(handout__plan=plan, status=TrialStatus.SCORED, episode__frames__gt=0)

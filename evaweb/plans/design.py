@@ -159,7 +159,11 @@ class Tried:
     again: list[list[bool]]
 
     def against(self, winner: int, loser: int) -> list[Block]:
-        """Return `counted` with the worst outcome for `winner` in each trial that had an attempt discarded unscored."""
+        """Return the blocks of `counted`, changed to the worst case for arm `winner` of a comparison with arm `loser`.
+
+        The change affects each trial of these two arms with an earlier attempt that was discarded unscored. Such a
+        trial gets outcome 0 if it is of `winner`, and outcome 1 if it is of `loser`.
+        """
         worst = {winner: 0.0, loser: 1.0}
         return [
             tuple(
@@ -281,9 +285,10 @@ def blocks_of_record(kept: Mapping[str, Any]) -> list[Block]:
 
 
 def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
-    """Return True if both lists have the same trials.
+    """Return True if both lists have the same trials in each block.
 
-    The order within a block is ignored, because old reveals did not store it.
+    The order within a block is ignored, because early versions of this program did not store it at the reveal of a
+    plan.
     """
     return [sorted(block) for block in one] == [sorted(block) for block in other]
 
@@ -380,8 +385,8 @@ def register_reveal_data(told: Callable[[Plan], dict[str, Any]]) -> None:
 def reveal_record(plan: Plan) -> dict[str, Any] | None:
     """Return the data stored at a reveal, with their digest: blocks that count, sums per checkpoint, registered data.
 
-    Because the data are stored, later corrections do not change the plan's headline. None for a plan without a
-    comparison before format 7.
+    Because the data are stored, later corrections do not change the plan's headline. The result is None for a plan that
+    has no comparison and whose document has a format before 7.
     """
     document = plan.document or {}
     if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:

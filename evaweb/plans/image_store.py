@@ -124,7 +124,10 @@ def decoded(jpeg: bytes, colorspace: str) -> np.ndarray[tuple[int, ...], np.dtyp
 def brought(
     picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], height: int, width: int
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Return the picture downscaled to float64 [height, width, channels] by area averaging."""
+    """Return the picture reduced to this height and width by area averaging.
+
+    The result is float64 [height, width, channels].
+    """
     rows = np.linspace(0, picture.shape[0], height + 1).round().astype(int)
     columns = np.linspace(0, picture.shape[1], width + 1).round().astype(int)
     bands = np.stack(

@@ -177,7 +177,10 @@ def _text(content: bytes, name: str) -> str:
 
 
 def import_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
-    """Store the pictures, and make each a reference unless this lab has one there; return a message per scene."""
+    """Store the pictures, and make each the reference of its station, position and camera.
+
+    A reference that this lab already has there is kept. Return a message per scene.
+    """
     by_scene: dict[str, Counter[str]] = {}
     for row in rows:
         by_scene.setdefault(row["scene"], Counter())[_taken(row, found, user)] += 1

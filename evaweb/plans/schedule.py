@@ -114,7 +114,11 @@ class _Coins:
         self._ahead: dict[Condition, int] = {}
 
     def next(self, condition: Condition) -> str:
-        """Return the checkpoint of the next trial at a condition, drawn by a coin unless one is too far behind."""
+        """Return the checkpoint of the next trial at a condition.
+
+        A fair coin decides. But if one checkpoint is IMBALANCE trials behind the other at this condition, it is the
+        next.
+        """
         ahead = self._ahead.get(condition, 0)  # lead of the first checkpoint
         second = ahead == IMBALANCE or (ahead > -IMBALANCE and self._chance.below(2) == 1)
         self._ahead[condition] = ahead + (-1 if second else 1)

@@ -76,7 +76,7 @@ def plans_open(*, station: Station) -> list[Plan]:
 
 
 def remaining(plan: Plan, dropped: Mapping[str, int] | None = None) -> int:
-    """Return the number of slots that do not count yet, except the slots of `dropped` checkpoints."""
+    """Return the number of slots that have no scored trial yet, except the slots of `dropped` checkpoints."""
     counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
     return without_dropped(plan.slots.exclude(pk__in=counted), dropped or {}).count()
 

@@ -286,7 +286,10 @@ def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
 @once_more
 @transaction.atomic
 def amend_plan(*, user: User, plan: Plan, reason: str) -> Plan:
-    """Create a draft of the next version from the frozen one, which continues until the new one is frozen."""
+    """Create a draft of the plan's next version.
+
+    The present version stays in force until the draft is frozen.
+    """
     locked = _lock_plan(plan)
     _require_owner(locked, user)
     text = _reason(reason, "a plan is amended")
@@ -374,13 +377,14 @@ def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | No
 
 @transaction.atomic
 def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
-    """Close a running plan whose design has ended, if no trial of it is unfinished and no void is requested.
+    """Close a running plan whose design has ended, if no trial of the plan is unfinished and no void is requested.
 
     If trials are left, the plan is closed only when the next trial is requested (`asked`). Until then a mistyped score
-    can be corrected, and switching a score back and forth does not reveal which trial is of which checkpoint. A
-    boundary that is found crossed at a request is recorded, and counts whatever is corrected later; otherwise each
-    request would reveal the effect of a correction. The recorded reason is that a boundary was crossed or all pairs are
-    made, never for which checkpoint.
+    can be corrected, and switching a score back and forth does not reveal which trial is of which checkpoint.
+
+    A boundary that is found crossed at a request is recorded, and counts whatever is corrected later; otherwise each
+    request would reveal the effect of a correction. The recorded reason says that a boundary was crossed or that all
+    pairs have been run. It never says for which checkpoint a boundary was crossed.
     """
     locked = _lock_plan(plan)
     result = findings_of(locked) if locked.state == PlanState.FROZEN else None

@@ -15,7 +15,10 @@ LONGEST_S = 3600.0
 
 @job_kind("preflight", queue=Queue.STATION, folder=False)
 def preflight(work: JobContext) -> Mapping[str, Any]:
-    """Query the checkpoint's server with the station's deployment file; args: preflight."""
+    """Query the checkpoint's server, as described in the station's deployment file.
+
+    The job has one argument: `preflight`, the id of the preflight.
+    """
     row: Preflight = preflight_get(id=work.args["preflight"])
     from runtime.station.preflight_child import (
         run_preflight,

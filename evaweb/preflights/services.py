@@ -1,7 +1,8 @@
-"""Services for preflights: run by a station, or by a worker with the deployment file if the station is not running.
+"""Services for preflights.
 
-The station's process has the keys, the tunnels and the deployment, and reaches the server the way a run would. It runs
-one preflight at a time, never during other work, and stores the report until it is fetched.
+A preflight is run by its station, or by a worker with the station's deployment file if the station is not running. The
+station's process has the keys, the tunnels and the deployment, and reaches the server the way a run would. It runs one
+preflight at a time, never during other work, and stores the report until it is fetched.
 """
 
 from __future__ import annotations

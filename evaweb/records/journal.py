@@ -68,9 +68,9 @@ def clean_text(name: str, given: str, longest: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RowPath:
-    """Query path to the row's attribute that a field of a line holds, such as `rater__username`.
+    """Annotation of a line's field: the query path to the attribute of the row that has the field's value.
 
-    "" stands for the field's own name.
+    An example is `rater__username`. "" stands for the field's own name.
     """
 
     path: str
@@ -144,7 +144,10 @@ class Line(BaseModel):
         )
 
     def to_row_values(self) -> dict[str, Any]:
-        """Return the values of the row, with people as accounts; values stored in other rows are omitted."""
+        """Return the values of the database row.
+
+        Usernames are replaced by their accounts. Values that are stored in other rows are omitted.
+        """
         values = {}
         for name in type(self).names():
             field, _, further = type(self).path_of(name).partition("__")

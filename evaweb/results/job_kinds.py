@@ -18,7 +18,10 @@ _NAMED = 50  # codes of trials without images in the result
 # Other users start it on the page of their own plan.
 @job_kind(automatic.KIND, least=lambda args: Role.ADMIN, queue=Queue.GPU)
 def judge(work: JobContext) -> Mapping[str, Any]:
-    """Show a plan's trials to a judge, and enqueue a job for the remaining ones; args: plan, judge."""
+    """Show trials of a plan to a judge for a limited time, and enqueue a job for the remaining trials.
+
+    The job has two arguments: `plan`, the id of the plan, and `judge`, the name of the judge.
+    """
     plan, name = Plan.objects.get(pk=work.args["plan"]), work.args["judge"]
     until, count = time.monotonic() + _TURN_S, 0
     while automatic.judge_next_trial(plan=plan, name=name):

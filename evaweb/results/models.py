@@ -133,7 +133,7 @@ class AutomaticJudge(models.Model):
 
     @property
     def setup(self) -> Setup:
-        """Set-up from which its module builds the judge."""
+        """Set-up from which the judge is built by the module for its kind."""
         return Setup(self.address, self.model, self.key_variable, self.plain, self.patience_s)
 
     def clean(self) -> None:

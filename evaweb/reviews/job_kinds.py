@@ -31,7 +31,10 @@ AT_ONCE = 20  # jobs queued per call of a periodic task
 
 @job_kind("quality")
 def quality(work: JobContext) -> Mapping[str, Any]:
-    """Check an episode and store the report; args: uuid."""
+    """Check the quality of an episode and store the report.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     # Imported late: web processes import this module but never run the job.
     from runtime.quality.settings import QualitySettings, read_settings
 
@@ -71,7 +74,10 @@ def _inspected(episode: Episode, settings: QualitySettings) -> Report:
 
 @job_kind("sides")
 def write_sidecars_job(work: JobContext) -> Mapping[str, Any]:
-    """Attach reviews and annotations to the published episode; args: uuid."""
+    """Attach reviews and annotations to the published episode.
+
+    The job has one argument: `uuid`, the episode's.
+    """
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     if episode.dataset_index is None:
         return {"attached": False, "why": "it is in no dataset"}
@@ -96,7 +102,10 @@ def find_unchecked_episodes() -> int:
 
 @periodic_task("reviews to be published")
 def find_outdated_sidecars() -> int:
-    """Queue updates of published episodes with newer reviews, or reviews older than the publication."""
+    """Queue updates of the sidecars of published episodes that lack the newest reviews.
+
+    A sidecar lacks them if a review changed after it was written, or if the episode was published after it was written.
+    """
     rows = list(selectors.outdated_episodes()[:AT_ONCE])
     for standing in rows:
         with transaction.atomic():

@@ -31,7 +31,7 @@ _judges: list[Judges] = []
 
 
 def get_standing(*, episode: Episode) -> Standing:
-    """Return the episode's standing; an unsaved empty one if there is none."""
+    """Return the summary of the episode's reviews; if there is none, return an empty one that is not saved."""
     return Standing.objects.filter(episode=episode).select_related("review__reviewer").first() or Standing(
         episode=episode
     )

@@ -76,7 +76,11 @@ class Filter:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Column header: `next` is the sort parameter that a click sets (None: the default); `sorted` is for aria-sort."""
+    """Header of a column.
+
+    `next` is the sort parameter that a click on the header sets; None sets the default order. `sorted` is the value of
+    the header's attribute aria-sort, "" if the list is not sorted by this column.
+    """
 
     column: Column
     next: str | None

@@ -74,7 +74,10 @@ def _name_until(request: HttpRequest) -> datetime:
 
 
 def _many_names_until(request: HttpRequest) -> datetime | None:
-    """Return when this address will have failures of fewer than MOST_NAMES names; None if that is so now."""
+    """Return until when logins from this address are refused; None if they are not refused now.
+
+    They are refused while passwords of at least MOST_NAMES names were wrong there within AXES_COOLOFF_TIME.
+    """
     since = timezone.now() - settings.AXES_COOLOFF_TIME
     attempts = AccessAttempt.objects.filter(ip_address=lockable_of(request), attempt_time__gt=since)
     newest = attempts.values("username").annotate(at=Max("attempt_time")).order_by("-at")

@@ -109,7 +109,7 @@ def _is_export(scope: dict[str, Any]) -> bool:
 def _login_of(scope: dict[str, Any]) -> bytes:
     """Return the credentials of a request, unverified.
 
-    Invented credentials cannot multiply the share: the limit per address holds as well.
+    A client does not get more slots by inventing credentials, because the limit per address holds as well.
     """
     return b"".join(value for name, value in scope["headers"] if name in (b"authorization", b"cookie"))
 

@@ -1,7 +1,7 @@
 """Static files served from memory, compressed once, at URLs that contain a digest of all files.
 
-A browser does not request a file again that it has: a page has about a hundred of them. After an upgrade the URLs
-differ, so that no page mixes files of two versions.
+A page has about a hundred of these files. A browser that has a file already does not request it again. After an upgrade
+the URLs differ, so that no page mixes files of two versions.
 """
 
 from __future__ import annotations

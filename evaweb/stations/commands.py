@@ -373,7 +373,10 @@ def _first_or_own(row: Command) -> Command | None:
 
 
 def _latched_again(row: Command, first: Command) -> bool:
-    """Return True if this press latched the e-stop anew, at another time than the first with its uuid."""
+    """Return True if the press `row` latched the e-stop anew, and not at the same time as `first` did.
+
+    `first` is the press that was recorded first with the same uuid.
+    """
     at = first.data.get("carried_out_at")
     return row.data.get("latched") == "anew" and at not in (None, row.data["carried_out_at"])
 
@@ -424,9 +427,11 @@ def _update(row: Command) -> None:
 def _message(
     row: Command, role: str = "", vouched: Sequence[str] = (), valid_until: float = float("inf")
 ) -> messages.Command:
-    """Return the command as sent.
+    """Return the command in the form in which it is sent to the runtime.
 
-    `role` is the user's; it is "" for stops, which need no role and wait for no database.
+    `role` is the user's role. It is "" for stops, which need no role and wait for no database. `vouched` are the names
+    of arguments that come from an administrator's table or the lab's records instead of the user. `valid_until` is the
+    time on the runtime's clock after which the command is no longer executed.
     """
     return messages.Command(
         str(row.uuid),

@@ -1,4 +1,4 @@
-"""Enrolment of other computers as stations: one-time codes, their keys, and the list of admitted keys."""
+"""Enrolment of other computers as stations: one-time codes, the computers' keys, and the list of admitted keys."""
 
 from __future__ import annotations
 

@@ -94,7 +94,10 @@ class Keys:
 def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
     """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; print the address as JSON.
 
-    `owner` returns the name of the station that owns an offered episode. Raises: GateError.
+    `where` is the host to listen on and its two ports; port 0 chooses a free port. `owner` returns the name of the
+    station that owns an offered episode.
+
+    Raises: GateError.
     """
     try:
         with _lock_gate(key_files.folder(settings.DATA_DIR) / "gate.lock"):

@@ -15,7 +15,10 @@ def holder_of(username: str, page: str) -> str:
 
 
 def holder_display_name(holder: str) -> str:
-    """Return a holder's name for users: the user name for a page."""
+    """Return a lease holder's name as it is shown to users.
+
+    If the holder is a page, this is the user's name; any other name is unchanged.
+    """
     return holder.split(":")[1] if holder.startswith("web:") else holder
 
 

@@ -1,7 +1,8 @@
 """Leases: the right to command a station, granted by the web and enforced by the station's runtime.
 
-A lease begins when the runtime has accepted it and ends when the runtime reports so; the rows are the record.
-The holder's page renews its lease in a stream, which touches no row.
+A lease begins when the runtime has accepted it, and ends when the runtime reports its end. The rows in the database are
+the record of this. The page of the holder renews its lease continually; the renewals go to the runtime and do not touch
+the database.
 """
 
 from __future__ import annotations

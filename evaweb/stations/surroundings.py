@@ -93,7 +93,11 @@ def _at_poses(drawn: DrawnRobot) -> list[list[Box]]:
 
 
 def _roots(drawn: DrawnRobot) -> list[Float64]:
-    """Return the positions of the roots of the robot's copies of its URDF, [3] each."""
+    """Return the positions [3] at which the arms are mounted, at the home pose.
+
+    A robot may consist of several copies of its URDF, for example one per arm. Each copy has a root link, whose
+    position is returned.
+    """
     root = urdf.read(drawn.robot.urdf).root
     poses = drawn.scene.poses(drawn.robot.poses["home"])
     return [poses[part, :3, 3] for part in drawn.scene.parts_showing(root)]
@@ -108,7 +112,9 @@ def _floor(drawn: DrawnRobot, home: Sequence[Box]) -> float | None:
 def _table(drawn: DrawnRobot, home: Sequence[Box]) -> Rectangle:
     """Return the table as (x from, x to, y from, y to) [m].
 
-    It is large enough for all bases that are on it, and is cut clear of a robot's body that reaches below it.
+    The table extends under every base of the robot that stands on the table. Where a part of the robot's body reaches
+    below the table, the table is cut so that it does not touch this part. `home` has the bounding boxes of the body at
+    the home pose.
     """
     x_from, x_to, y_from, y_to = _LEAST_TABLE
     for x, y, z in _roots(drawn):
@@ -184,7 +190,10 @@ def _ahead(drawn: DrawnRobot) -> list[float]:
 
 
 def _view(boxes: Sequence[Box]) -> dict[str, list[float]]:
-    """Return the volume to be visible: the robot in each of its named poses, and AREA."""
+    """Return the volume that the 3D view has to show, as its corners "low" and "high" [3] in m.
+
+    It contains `boxes`, the bounding boxes of the robot in each of its named poses, and AREA, where objects may lie.
+    """
     x_from, x_to, y_from, y_to = AREA
     low = [np.array([x_from, y_from, 0.0]), *(box.low for box in boxes)]
     high = [np.array([x_to, y_to, 0.0]), *(box.high for box in boxes)]

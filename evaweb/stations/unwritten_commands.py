@@ -107,7 +107,10 @@ class UnwrittenCommands:
         return waits
 
     def _adopt(self, lines: Sequence[bytes]) -> bool:
-        """Store the journaled commands of a killed process: one per merge key, with a count.
+        """Store the commands in the journal of a process that was killed.
+
+        Presses that are merged into one row of the database (see `merge_key`) are stored as one command with their
+        number.
 
         Returns: Whether all lines were commands; other lines are logged.
         """

@@ -14,7 +14,10 @@ _A_YEAR = 365 * 24 * 3600
 
 @require_safe
 def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
-    """Return the scene of a station; its robot has the groups ?groups=a,b, as its runtime reports them."""
+    """Return the scene of a station as JSON.
+
+    The query ?groups=a,b selects the joint groups with which the robot is drawn: those that its runtime reports.
+    """
     try:
         station = station_get(name=name)
         document = geometry.scene_geometry(station.robot, _groups(request), simulated=station.simulated)
@@ -25,7 +28,10 @@ def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
 
 @require_safe
 def robot_geometry(request: HttpRequest, robot: str) -> JsonResponse:
-    """Return the scene of a robot alone, with ?groups=a,b or all that are not optional."""
+    """Return the scene of a robot alone as JSON.
+
+    The robot is drawn with the joint groups in ?groups=a,b; without this query, with all groups that are not optional.
+    """
     try:
         return JsonResponse(geometry.scene_geometry(robot, _groups(request), simulated=False))
     except NotFound as error:

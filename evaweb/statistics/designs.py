@@ -147,10 +147,9 @@ def design(
     block.
 
     Raises:
-        StatisticsError: The combination is not allowed: a margin with a rule that allows no margin, looks with a rule
-        that
-            allows no looks, an exact boundary with more than 250 trials per arm, or arms in random order with scores or
-            an e-process.
+        StatisticsError: If the combination is not allowed: a margin with a rule that allows no margin, looks with a
+            rule that allows no looks, an exact boundary with more than 250 trials per arm, or arms in random order with
+            scores or an e-process.
     """
     check_design(
         rule=rule,
@@ -191,7 +190,13 @@ def check_design(
     drops: bool = False,
     paired: bool = True,
 ) -> None:
-    """Raise the errors of `design` without computing a boundary; `paired` is False for two arms in random order."""
+    """Raise the errors that `design` would raise for the same arguments, without computing a boundary.
+
+    `paired` is False if two arms are tried in random order.
+
+    Raises:
+        StatisticsError: If the arguments are invalid.
+    """
     check_alpha(alpha)
     if rule not in RULES:
         raise StatisticsError(f"design = {rule!r}; allowed: {', '.join(RULES)}")
@@ -250,13 +255,14 @@ def _bounded(unbounded: Design, schedule: Sequence[int]) -> Boundary:
 
 
 def findings(found: Design, blocks: Sequence[Block]) -> Findings:
-    """Return the conclusions of a design from `blocks`, given in the schedule's order up to the first incomplete
-    block.
+    """Return the conclusions of a design from `blocks`, given in the schedule's order up to the first incomplete block.
 
     Comparisons are decided in the order of the blocks at which they end, so that the result does not depend on which
-    trial finishes first. If arms are dropped, a block is complete when it has all arms that were not dropped before
-    it. An arm that was found worse leaves its other comparisons, except a control that is in all of them; with a
-    margin no arm is found worse.
+    trial finishes first.
+
+    If arms are dropped, a block is complete when it has all arms that were not dropped before it. When an arm is found
+    worse, its other comparisons end too. An exception is a control that is in all comparisons: they continue. With a
+    margin, no arm is ever found worse.
     """
     trials = blocks[: found.blocks]
     if not found.drops:
@@ -380,7 +386,7 @@ Sides = tuple[list[float], list[float]]  # outcomes of the first and of the seco
 
 
 def _complete_blocks(frozen: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
-    """Yield the outcomes by side of the blocks before the first incomplete one."""
+    """Yield, for each block before the first incomplete one, the outcomes of either arm of `pair`."""
     before = (0, 0)
     for number, block in enumerate(blocks):
         sides = ([value for arm, value in block if arm == pair[0]], [v for arm, v in block if arm == pair[1]])

@@ -1,6 +1,6 @@
 """Permutation test of paired differences: if both arms are equal, each difference may as well have the other sign.
 
-Formulae: Fisher's sign flips (1935), all counted by their sums instead of sampled.
+This is Fisher's test by sign flips (1935). All combinations of signs are counted by their sums; none is sampled.
 """
 
 from __future__ import annotations

@@ -143,7 +143,11 @@ def preferences(
 
 
 class _Design:
-    """Comparisons as cells of a multinomial logit, linear in x = (log-worths except the first, f, g)."""
+    """Comparisons as the cells of a multinomial logit, which is linear in the vector x of unknowns.
+
+    The unknowns are the log-worths of all policies except the first, then f (for ties) and g (for the order of
+    presentation), as in the module's formula. f is left out without ties, and g without an effect of order.
+    """
 
     def __init__(self, comparisons: Sequence[Comparison], order_effect: bool) -> None:
         import numpy as np

@@ -1,11 +1,13 @@
 """Operating characteristics of designs that compare scores, at assumed scores: power, and number of pairs.
 
-Assumptions: means, a standard deviation, and scores that are shares of a number of equal points with a beta-binomial
-distribution (Skellam 1948), the widest family between points that are reached independently and all or none. Pairs are
-independent, and so are the two scores of a pair. Evaluations are simulated with a fixed seed, and each is decided by
-the design's own test. For a fixed number this is the test of `permutation.sign_flip_test`, whose sums are counted
-exactly, here by their characteristic function for all evaluations at once; otherwise it is
-`sequential.score_evidence`.
+The user assumes mean scores, a standard deviation, and the number of equal points of which a score is a share. The
+points of a score are assumed to have a beta-binomial distribution (Skellam 1948). It is the widest family between two
+extremes: points that are reached independently, and points that are all reached or none. Pairs are independent, and so
+are the two scores of a pair.
+
+Evaluations are simulated with a fixed seed, and each is decided by the design's own test. For a fixed number of pairs
+this is the test of `permutation.sign_flip_test`, which counts the sums exactly; here they are computed by their
+characteristic function for all evaluations at once. Otherwise it is the test of `sequential.score_evidence`.
 """
 
 from __future__ import annotations
@@ -120,7 +122,10 @@ def score_pairs_needed(rule: str, scores: Scores, power: float, alpha: float) ->
 
 @lru_cache(maxsize=8)
 def _differences(scores: Scores) -> NDArray[Any]:
-    """Return simulated score differences in points [runs, MOST]; the first columns are those of a smaller design."""
+    """Return simulated score differences in points: int8 [runs, MOST], one row per evaluation.
+
+    A design with fewer pairs than MOST uses the first columns.
+    """
     import numpy as np
 
     chance = np.random.default_rng(_SEED)
@@ -157,7 +162,10 @@ def _flipped(differences: NDArray[Any], points: int) -> NDArray[Any]:
 
 @lru_cache(maxsize=32)
 def _stops(scores: Scores, alpha: float) -> NDArray[Any]:
-    """Return the number of pairs after which the e-process stops each simulated evaluation; MOST + 1: never."""
+    """Return, for each simulated evaluation, the number of pairs after which the e-process stops it.
+
+    The number is MOST + 1 for an evaluation that is never stopped.
+    """
     import numpy as np
 
     differences = _differences(scores).astype(np.intp) + scores.points

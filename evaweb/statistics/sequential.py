@@ -57,8 +57,9 @@ class Evidence:
 def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -> Evidence:
     """Return the evidence of pairs (first succeeded, second succeeded) in the order in which they were run.
 
-    Each pair may have its own success rate, as when both arms start from the same initial condition: the bet is fair
-    at any common rate. The order must be the true one, and pairs must not be omitted.
+    Each pair may have its own success rate, as when both arms start from the same initial condition. The bet that the
+    evidence is computed from is fair whenever both arms of a pair have the same rate, whatever that rate is. The order
+    must be the true one, and pairs must not be omitted.
     """
     check_alpha(alpha)
     first, second = [], []
@@ -75,7 +76,14 @@ def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -
 
 
 def _factor(p: float, q: float, worse: bool, better: bool) -> float:
-    """Return the gain of log e from one pair, with the rates `p` and `q` that were predicted before it."""
+    """Return by how much one pair of trials increases the logarithm of the e-value for "the better arm is better".
+
+    Args:
+        p: Success rate of the worse arm, as predicted before this pair.
+        q: Success rate of the better arm, as predicted before this pair.
+        worse: Whether the trial of the worse arm succeeded.
+        better: Whether the trial of the better arm succeeded.
+    """
     if p >= q:
         return 0.0
     m = (p + q) / 2

@@ -112,9 +112,10 @@ def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None
 
 
 def interaction(tables: Sequence[StratumTable]) -> float | None:
-    """Return the exact probability of tables at least as improbable if the odds ratio is the same in all strata.
+    """Return the p-value of Zelen's exact test of whether the odds ratio is the same in all strata.
 
-    None if fewer than two strata are informative, or the combinations are too many to enumerate.
+    It is the probability, if the odds ratios are equal, of tables that are at least as improbable as the observed ones.
+    The result is None if fewer than two strata are informative, or if there are too many combinations to enumerate.
     """
     telling = sorted((table for table in tables if table.is_informative), key=lambda table: len(table.ways))
     if len(telling) < 2 or math.prod(len(table.ways) for table in telling[:-1]) > _MOST:

@@ -329,7 +329,10 @@ class CheckpointForm(forms.ModelForm):
         return {} if policy is None else policy
 
     def clean_strategy(self) -> Any:
-        """Return the strategy's table; None for an empty field: then that of the plan or station applies."""
+        """Return the checkpoint's strategy table, or None if the field is empty.
+
+        A checkpoint without a strategy of its own uses that of the plan or of the station.
+        """
         return self.cleaned_data["strategy"] or None
 
 

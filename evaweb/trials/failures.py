@@ -70,7 +70,7 @@ def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
 
 
 def score_failure(score: Score | None) -> dict[str, str]:
-    """Return phase and cause of a score by field, {} without a score."""
+    """Return the phase and the cause of the failure in a score as {field: text}; {} without a score."""
     return {field: getattr(score, field) for field in FIELDS} if score else {}
 
 

@@ -308,7 +308,11 @@ def _restore_void_requests(trial: Trial, lines: Sequence[Judgement]) -> int:
 
 
 def _publish(trial: Trial, *, made: bool) -> None:
-    """Queue the publication if it may be missing: its job was lost with the database."""
+    """Queue the publication of a scored trial's episode, if it may be missing in the dataset or be out of date.
+
+    Its job was lost with the database. `made` is True if the row of the trial was created just now; then an episode
+    that is in a dataset is not published again.
+    """
     episode = trial.episode
     if trial.status not in lifecycle.SCORED_STATES or episode is None or episode.status not in CLOSED:
         return

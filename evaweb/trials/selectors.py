@@ -164,7 +164,11 @@ _NAMED = ("evaluation", "checkpoint", "scene", "position", "station", "operator"
 
 @dataclass(frozen=True, slots=True)
 class TrialFilters:
-    """Selection of trials by names, "" for any. `since`: a day or an ISO 8601 time."""
+    """Selection of trials.
+
+    Each field is the name that a trial must have there; "" matches any. `since` selects trials that were prepared at or
+    after this time: a day, or a time in ISO 8601.
+    """
 
     evaluation: str = ""
     checkpoint: str = ""

@@ -490,7 +490,11 @@ def _judges_alike(score: Score | None, outcome: ScoredOutcome) -> bool:
 def _times_before(
     trial: Trial, milestones: Sequence[Milestone], ticks: Mapping[object, object]
 ) -> dict[object, float]:
-    """Return the times of the current score for milestones still ticked; {} if the scene now forbids them."""
+    """Return the times [s] at which milestones were reached according to the current score, by id of the milestone.
+
+    Only milestones that are still ticked are included. The result is {} if the scene now forbids these times, because a
+    time limit or the order of the milestones is violated.
+    """
     outcomes = trial.verdict.outcomes.exclude(at_s=None) if trial.verdict else ()
     seconds = {outcome.milestone_id: outcome.at_s for outcome in outcomes if outcome.reached}
     ticked = {str(key) for key, reached in ticks.items() if reached is True}

@@ -278,6 +278,10 @@ def _time(event: Mapping[str, Any]) -> float | None:
 
 
 def _reason(event: Mapping[str, Any]) -> str:
-    """Return "stop by ann" of a command event "stop by ann: accepted", "why" of a state event "a -> b: why"."""
+    """Return the reason in the text of a station's event.
+
+    For a command event with the text "stop by ann: accepted" it is "stop by ann".
+    For a state event with the text "a -> b: why" it is "why".
+    """
     before, _, after = str(event.get("text") or "").partition(": ")
     return before if event.get("kind") == "command" else after or before

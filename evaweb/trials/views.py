@@ -114,7 +114,10 @@ def void_answer(request: HttpRequest, id: int) -> HttpResponse:
 
 
 def _truth(trial: Trial) -> list[tuple[str, Any]]:
-    """Return the milestones in the ground truth; hidden from a blind trial's operator before scoring."""
+    """Return (name, reached) of each milestone in the simulated bench's ground truth.
+
+    The caller must hide them from a blind trial's operator before scoring.
+    """
     return sorted((trial.truth or {}).get("milestones", {}).items())
 
 

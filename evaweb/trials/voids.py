@@ -125,9 +125,10 @@ def open_void_requests(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
 
 
 def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
-    """Restore trials whose void request was not answered in time, or with `now` all with an open request.
+    """Restore the trials whose void requests were not answered in time.
 
-    Trials with an unfinished repetition wait for its end. Call within a transaction.
+    If `now` is set, restore all trials with an open request, however recent. A trial whose repetition is unfinished is
+    restored only after the repetition has ended. Call this within a transaction.
     """
     requests = open_void_requests(trials)
     if not now:

@@ -115,7 +115,11 @@ def _guarded(label: str, parts: Iterator[Named], notes: list[str]) -> Iterator[N
 
 
 def _logs(visibility: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield names and ends of logs; no logs for blind readers, because logs name checkpoints and servers."""
+    """Yield (name, text) of each log file, where the text is the end of the file if the file is too long.
+
+    A reader from whom anything is hidden by a blind plan gets no logs, because logs name checkpoints and servers. Each
+    log that is cut short is mentioned in `notes`.
+    """
     if not visibility.hides_nothing:
         return
     room = LONGEST_LOGS

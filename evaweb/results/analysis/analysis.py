@@ -42,8 +42,16 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """Analysis of an evaluation: its arms, best first, all comparisons with summarising letters, and recipes
-    with several runs.
+    """Analysis of an evaluation.
+
+    Attributes:
+        n: Number of trials that count.
+        arms: Results of each checkpoint, the best first.
+        comparisons: All comparisons of two checkpoints.
+        letters: Letters of each checkpoint. Checkpoints that share a letter were not found to differ.
+        alpha: Error probability of all comparisons together.
+        notes: Remarks on the analysis.
+        recipes: Training recipes with several training runs.
     """
 
     n: int

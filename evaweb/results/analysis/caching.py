@@ -146,7 +146,11 @@ def limits_of(plan: Plan) -> dict[str, float]:
 def cached_page(
     plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return the cached contents of one of the plan's pages, figures included; `make` builds them."""
+    """Return the contents of one of the plan's pages, with its figures, from the cache; `make` builds them if needed.
+
+    `name` identifies the page and the choices of its user. `at` is the current fingerprint of the plan: contents that
+    were built at another fingerprint are not used.
+    """
     return _pages.get((plan.pk, plan.digest, name), at, make)
 
 

@@ -84,9 +84,9 @@ def _same_scenes(first: Plan, second: Plan) -> set[str]:
 
 
 def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
-    """Return the checkpoint's trials that count in these scenes, in order of allocation.
+    """Return the checkpoint's trials in these scenes that count, in order of allocation.
 
-    Of a revealed plan they have the scores at its reveal.
+    If the plan is revealed, the trials have the scores that they had at the reveal.
     """
     return [
         _Tried(plan, (outcome.station, outcome.scene, outcome.position), outcome.success)

@@ -20,13 +20,20 @@ or only the note.
 
 @dataclass
 class CheckpointChanges:
-    """Numbers of attempts of one checkpoint, and of those that do not count or were changed.
+    """Numbers of one checkpoint's attempts, of attempts that do not count, and of scores that were changed.
 
-    `voided_successes` and `voided_failures` are voided trials by their last score, `voided_unscored` those without a
-    score; `asked` are void requests that wait for a second operator. `to_success` and `to_failure` are corrected
-    scores; `late` are corrections after the reveal, except those that changed only the category of a failure. `estop`,
-    `interruption` and `timeout` are runs by how they ended; `declared` are trials that count as failures by the plan's
-    rules, whatever was reached.
+    Attributes:
+        voided_successes: Voided trials whose last score is a success.
+        voided_failures: Voided trials whose last score is a failure.
+        voided_unscored: Voided trials without a score.
+        asked: Trials with a void request that waits for a second operator.
+        estop: Runs that were ended by an e-stop.
+        interruption: Runs that were ended by an interruption.
+        timeout: Runs that were ended by the time limit.
+        declared: Trials that count as failures by the plan's rules, whatever was reached.
+        to_success: Scores that were corrected from failure to success.
+        to_failure: Scores that were corrected from success to failure.
+        late: Corrections after the reveal, except those that changed only the category of a failure.
     """
 
     checkpoint: str

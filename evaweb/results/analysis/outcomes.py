@@ -116,7 +116,7 @@ def count_successes(trials: Sequence[Outcome]) -> tuple[int, int]:
 
 
 def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
-    """Return the trials by key, sorted by it."""
+    """Return the trials by key, with the keys in ascending order."""
     groups: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in trials:
         groups[key(outcome)].append(outcome)
@@ -125,9 +125,10 @@ def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[st
 
 @dataclass(frozen=True, slots=True)
 class TimeHorizon:
-    """Horizon of times to success, `until` [s], and time limits of scenes, `limits` [s].
+    """Horizon up to which times to success are compared, and the time limit of each scene.
 
-    The horizon is 0 if no trial has a known duration.
+    `until` [s] is the horizon. A success after the horizon counts like a failure: as not reached within the horizon.
+    The horizon is 0 if no trial has a known duration. `limits` maps names of scenes to time limits [s].
     """
 
     until: float

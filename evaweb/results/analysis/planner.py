@@ -81,7 +81,9 @@ _ALLOWED: dict[str, tuple[float, float]] = {
 
 
 def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
-    """Return the input from an address; with `alike` both rates may be equal.
+    """Return the calculator's input that the query of an address (`given`) describes.
+
+    Both success rates may be equal only if `alike` is set.
 
     Raises:
         EvaError: If a value is not allowed.

@@ -86,10 +86,10 @@ class PowerRequest:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Power and needs of the designs, as far as they are computed.
+    """Power of each design, and the trials that it needs, as far as they are computed already.
 
-    `curves` has the power by design in ascending numbers of pairs, `needs` the trials that each design needs for the
-    wanted power.
+    `curves` maps each design to its power at ascending numbers of pairs. `needs` maps each design to the trials that it
+    needs for the wanted power.
     """
 
     curves: dict[str, tuple[DesignPower, ...]] = field(default_factory=dict)

@@ -44,16 +44,17 @@ class Statistic:
     """Declaration of one statistic of an arm or a comparison.
 
     Attributes:
-        compute: Function from the trials to the value; it returns None or raises StatisticsError if they do not
-            determine it.
+        compute: Function from the trials to the value. If the trials do not determine the value, the function
+            returns None or raises StatisticsError.
         key: Name in JSON, also used by REST and reports; "" if another declaration writes the value.
         form: Function from the value to its JSON.
         write: Used instead of `key` and `form`: function from the whole arm or comparison to a part of its JSON
             object.
-        answers: Function from comparison, value and context to the answers.
+        answers: Function from the comparison, the value and the context (`AnswerContext`) to the answers that pages
+            show.
         rank: Order of the answers; within one rank they are in the order of declarations.
         none_too: Whether `answers` is also called with the value None.
-        describes: Whether it is shown while the design of its comparison has not ended.
+        describes: Whether the statistic is shown while the design of its comparison has not ended.
         column: Column of the table of checkpoints.
     """
 

@@ -60,7 +60,10 @@ def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
 
 
 def evidence_text(found: Evidence) -> str:
-    """Return as text whether the evidence suffices, and since when or how strong it is."""
+    """Return the state of the evidence as text.
+
+    The text says since which pair the evidence suffices or, if it does not, how strong it is.
+    """
     if found.stop is not None:
         return f"suffices since pair {found.stop}"
     if not found.pairs:

@@ -177,8 +177,9 @@ def _was(request: HttpRequest) -> dict[str, Any]:
 def _shown(now: Values, last_shown: Values, faults: dict[str, str]) -> dict[str, Any]:
     """Return the state that the page keeps and sends with its next request.
 
-    The state has `last_shown`, from which the page's changes are distinguished from other people's, the digest of the
-    saved values `now`, which is needed to freeze the plan, and `faults`.
+    It consists of `last_shown`, the digest of the saved values `now`, and `faults`. A value that differs from
+    `last_shown` was changed on the page; other differences were made by other people. The digest is needed to freeze
+    the plan.
     """
     return {"was": json.dumps(last_shown), "seen": digest_of(now), "faults": faults}
 

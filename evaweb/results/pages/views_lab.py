@@ -42,7 +42,11 @@ def wall(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def planner(request: HttpRequest) -> HttpResponse:
-    """Render the calculator of the trials and robot hours that a difference needs, and of what the time can detect."""
+    """Render the calculator.
+
+    It computes the trials and robot hours that are needed to detect a difference, and the difference that can be
+    detected in the available time.
+    """
     fault = table = None
     waiting = False
     question = Question()

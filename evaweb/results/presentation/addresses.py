@@ -1,4 +1,4 @@
-"""Addresses of the trials behind a figure, of a comparison, and of two recordings."""
+"""Addresses of three kinds of pages: a list of trials, a comparison, and recordings played side by side."""
 
 from __future__ import annotations
 

@@ -41,12 +41,13 @@ def headline_alternatives(plan: Plan, matches: Mapping[int, float]) -> list[dict
 
     Each dict has a description, the number of pairs left, the sentence, and whether the conclusion is the same.
 
-    Alternatives that omit trials, for example those of one operator, omit their whole blocks. Each comparison is then
-    decided by the design's rule as if it had been planned for the remaining blocks (at its step of Holm's procedure, if
-    used); with checkpoints in random order it is one test of all of them. Before the design has ended there are no such
-    alternatives, because nothing was concluded.
+    Alternatives that omit trials, for example those of one operator, omit the whole blocks of these trials. Each
+    comparison is then decided by the design's rule as if the design had been planned for the remaining blocks. If the
+    plan uses Holm's procedure, the comparison is tested at the alpha that the procedure gives it. With checkpoints in
+    random order, all remaining blocks are compared by one test. Before the design has ended there are no alternatives
+    that omit trials, because nothing was concluded.
 
-    `matches` is the smallest bench match by trial, for trials with a known one.
+    `matches` maps the id of each trial with a known bench match to its smallest match.
     """
     frozen = frozen_design(plan.document) if plan.document else None
     if frozen is None:

@@ -1,4 +1,7 @@
-"""Figures of a result's checkpoints: on pages with links to the trials behind them, in reports without."""
+"""Figures that compare the checkpoints of a result.
+
+On pages, the figures have links to the trials that they are drawn from; in reports they have none.
+"""
 
 from __future__ import annotations
 

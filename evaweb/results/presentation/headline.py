@@ -323,7 +323,10 @@ class WorstCase:
 
 
 def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: Tried) -> list[WorstCase]:
-    """Return the worst case of each comparison that has a winner and discarded attempts."""
+    """Return the worst case of each comparison that has a winner and discarded attempts.
+
+    `decided` are the blocks by which the comparisons were decided; `now` are the trials with their discarded attempts.
+    """
     cases = []
     now = _as_decided(now, decided)
     for number, conclusion in enumerate(findings(found, decided).each):

@@ -160,7 +160,11 @@ def pair_rows(pairs: Sequence[tuple[int, Pair]]) -> list[dict[str, Any]]:
 
 
 def trial_row(trial: Trial) -> dict[str, Any]:
-    """Return a trial of a list, and the time in its recording after which the failure occurred."""
+    """Return one row of a list of trials, as a dict for the template.
+
+    For a failure, "moment" is the time [s] in the recording at which the last milestone was reached, so that the
+    failure occurred after it; None if unknown.
+    """
     outcomes = list(trial.verdict.outcomes.all()) if trial.verdict else []
     times = [at for row in outcomes if row.reached and (at := getattr(row, "at_s", None)) is not None]
     failed = bool(trial.verdict and not trial.verdict.success)

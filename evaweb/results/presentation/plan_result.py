@@ -50,7 +50,7 @@ class PlanResult:
 
     @cached_property
     def runs(self) -> caching.Runs:
-        """Trials that count and interrupted runs, all of them."""
+        """All trials that count, and all interrupted runs, whatever `only` selects."""
         return caching.cached_runs(self.plan, self.at)
 
     @cached_property

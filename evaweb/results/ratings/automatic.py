@@ -190,7 +190,10 @@ def judge_next_trial(*, plan: Plan, name: str) -> bool:
 
 
 def _short(text: str, longest: int) -> str:
-    """Return a third party's text on one line, with characters that both databases accept, and truncated."""
+    """Return a third party's text on one line, cut to at most `longest` characters.
+
+    Characters that SQLite or PostgreSQL would not accept are removed or replaced.
+    """
     return " ".join(text.replace("\x00", "").encode("utf-8", "replace").decode().split())[:longest]
 
 

@@ -1,4 +1,7 @@
-"""Restoring of ratings, preferences and judgements that the database lost from the journals of scores; see .record."""
+"""Restoring of ratings, preferences and judgements that the database has lost.
+
+They are read from the journals of scores, whose lines are declared in the module `record`.
+"""
 
 from __future__ import annotations
 

@@ -78,9 +78,10 @@ def _conduct(result: PlanResult) -> dict[str, Any]:
 
 
 def _attempts(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
-    """Yield the columns ATTEMPT of each attempt, and the reason of a void.
+    """Yield one row of texts for each attempt: its values of the columns in ATTEMPT, then why it was voided.
 
-    Other reasons are left out, because they may change when an attempt is scored later.
+    The last text is "" for an attempt that was not voided. Reasons for other states are left out, because they may
+    change when an attempt is scored later.
     """
     for row in rows:
         voided = row["status"] == TrialStatus.VOIDED

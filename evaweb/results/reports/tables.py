@@ -130,7 +130,7 @@ def _rows(result: PlanResult, attempts: QuerySet[Trial]) -> list[dict[str, Any]]
 
 
 def milestones_of(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
-    """Return by score the milestones and whether each was reached, in order."""
+    """Return a dict from the id of each score to its milestones, in order, as (text, whether it was reached)."""
     by_score: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows = MilestoneOutcome.objects.filter(score__in=scores).order_by("score_id", "order")
     for score, text, reached in rows.values_list("score_id", "text", "reached"):

@@ -14,9 +14,9 @@ from evaweb.lab.diagnosis import bundle
 
 
 class Command(BaseCommand):
-    """Command that writes the bundle.
+    """Command that writes the diagnostic bundle.
 
-    Without --unblinded it has nothing about blind plans, because its reader may be blind.
+    Without --unblinded the bundle contains nothing about blind plans, because the person who reads it may be blind.
     """
 
     help = "Versions, settings, machine, deployments, stations, jobs and logs of this lab in one file, without secrets."

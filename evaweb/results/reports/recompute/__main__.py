@@ -329,7 +329,10 @@ def _float(cell: str) -> float | None:
 
 
 def differences(shown: Any, found: Any, where: str) -> Iterator[tuple[str, str]]:
-    """Yield the place of each number in numbers.json, and how it differs from the recomputed one; "" if it does not."""
+    """Compare the numbers in numbers.json (`shown`) with the recomputed ones (`found`).
+
+    Yield for each number its place, which begins with `where`, and how it differs as text: "" if it agrees.
+    """
     if isinstance(found, Drawn):
         yield where, _drawn(shown, found)
     elif isinstance(shown, dict) and isinstance(found, dict):

@@ -330,7 +330,7 @@ def error(plan: Mapping[str, Any]) -> float:
 
 
 def share_of(plan: Mapping[str, Any]) -> float:
-    """Return alpha of each comparison."""
+    """Return the error probability of a single comparison: alpha divided by the number of comparisons."""
     return float(plan["stopping"]["alpha"]) / max(1, len(comparisons_of(plan)))
 
 
@@ -429,7 +429,10 @@ def _walked(
 
 
 def _mixed(share: Sequence[float], p: float) -> float:
-    """Return the mean of `share` over a binomial number of successes."""
+    """Return the mean of `share` [n + 1] if the number of successes is binomial with `n` trials and rate `p`.
+
+    `share` has one value for each number of successes, 0 to n.
+    """
     n = len(share) - 1
     middle = min(n, int(p * (n + 1)))
     at = math.exp(

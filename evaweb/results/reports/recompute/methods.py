@@ -1,4 +1,7 @@
-"""Formulae by elementary sums: binomial and Poisson tails instead of the lab's Beta and Gamma functions."""
+"""Statistical methods recomputed by elementary sums, without numpy or scipy.
+
+In place of the Beta and Gamma functions that the lab uses, there are sums of binomial and Poisson tails.
+"""
 
 from __future__ import annotations
 
@@ -154,7 +157,11 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
 
 
 def _highest(function: Callable[[float], float], low: float, high: float, parts: int) -> float:
-    """Return the maximum of a smooth function that may have several peaks."""
+    """Return the maximum of a smooth function between `low` and `high`.
+
+    The function may have several peaks. It is evaluated at `parts` equal steps, and the search is refined around the
+    three highest peaks.
+    """
     width = (high - low) / parts
     values = [function(low + i * width) for i in range(parts + 1)]
     best = max(values)
@@ -212,7 +219,11 @@ def holm(probabilities: Sequence[float]) -> list[float]:
 
 
 def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
-    """Return one letter for each maximal group without a separated pair, found by enlarging groups by one member."""
+    """Return the letters of each name, so that two names share a letter if and only if they are not in `apart`.
+
+    Each letter stands for a maximal group of names without a pair in `apart`. These groups are found by enlarging
+    smaller groups by one member at a time.
+    """
     groups = {frozenset([name]) for name in names}
     grown = True
     while grown:

@@ -58,7 +58,11 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Timing:
-    """Horizon of times to success [s], 0 without any duration, and each scene's limit [s]."""
+    """Horizon of times to success, and the time limit of each scene.
+
+    `until` [s] is the horizon; it is 0 if no trial has a known duration. `limits` maps names of scenes to time limits
+    [s].
+    """
 
     until: float
     limits: Mapping[str, float]

@@ -1,4 +1,4 @@
-"""Statements of the report's page and headline, compared with the numbers."""
+"""Check of the sentences in the report's headline and on its page against the recomputed numbers."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
 
 
 def _cells(arm: Mapping[str, Any]) -> list[str]:
-    """Return the expected cells of a checkpoint's row that follow its letters."""
+    """Return the expected cells of a checkpoint's row in the table, from the cell that follows its letters."""
     rate = f"{arm['successes']}/{arm['n']}, {100 * arm['rate']:.0f} % [{_ends(arm['wilson'])}]"
     means = (
         f"{100 * arm[name]['value']:.0f} % [{_ends(arm[name]['gaffke'])}]" for name in ("score", "macro")
