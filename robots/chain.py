@@ -39,7 +39,7 @@ class Chain:
 
     Raises:
         RobotError: If a joint on the path is neither driven, pinned nor a mimic of such a joint, or a driven joint
-        moves nothing.
+            moves nothing.
     """
 
     def __init__(

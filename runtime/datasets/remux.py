@@ -52,7 +52,7 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
 
     Raises:
         RecordingError: The source has fewer frames, does not start with a key frame, or has B-frames (its decoding
-        order would differ from the order of the rows).
+            order would differ from the order of the rows).
     """
     import av
 

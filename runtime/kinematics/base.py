@@ -112,7 +112,7 @@ class Kinematics(Forward):
             seed: Joints [D] from which the first frame is solved.
             dt: Time between frames [s]; if given, no joint exceeds its velocity limit between frames.
             anchor: Joints [D] commanded for the step before row `anchor_row`; the velocity limit also applies to the
-            motion from there to that row. If it is None, the first row is bound by joint limits only.
+                motion from there to that row. If it is None, the first row is bound by joint limits only.
             anchor_row: First row that will be executed; rows before it are stale, and bound by joint limits only.
         """
 

@@ -145,7 +145,7 @@ class CompiledKinematics(Kinematics):
 
         Raises:
             KinematicsError: Wrong shapes, numbers that are not finite, a quaternion of length zero, a `dt` of zero or
-            less, or a negative `anchor_row`.
+                less, or a negative `anchor_row`.
         """
         targets, seed = self._targets(targets), self._vector("a seed", seed)
         if dt is not None and not 0 < dt < np.inf:

@@ -133,7 +133,7 @@ class LerobotPolicy(Policy):
 
         Raises:
             PolicyLostError: The server is absent or does not respond. The next call opens another connection, and lets
-            the server load the checkpoint again if it has lost it.
+                the server load the checkpoint again if it has lost it.
             PolicyError: All responses were empty.
         """
         if conditioning is not None:

@@ -155,11 +155,11 @@ def join(
         arrival: The chunk.
         free_step: First step not yet sent.
         held: Target [D] that is held because nothing was planned (starvation, a distant first chunk of a run), or None.
-        The chunk takes over from it within JOIN_WINDOW steps, or within its own length if that is shorter.
+            The chunk takes over from it within JOIN_WINDOW steps, or within its own length if that is shorter.
         dims: Dimensions that do not blend linearly.
         joining: True if no chunk has been merged since the kind of strategy was changed. The new plan then takes over
-        from the old plan, whose last target is held as long as needed, or from `commanded` if nothing is planned. The
-        caller passes True again until a chunk is not dropped.
+            from the old plan, whose last target is held as long as needed, or from `commanded` if nothing is planned.
+            The caller passes True again until a chunk is not dropped.
         commanded: Last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole turn.
     """
     placed = merge.place(timeline, arrival, free_step)

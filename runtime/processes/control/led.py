@@ -44,7 +44,7 @@ class Led:
             speed: Velocity of the readings at the start [D].
             now: Present time [s].
             at_once: Joints that converge without parts and rests, bool [D]. During a rest, the command would pull back
-            an arm whose drive is switched on again, and a blocked arm would continue to press.
+                an arm whose drive is switched on again, and a blocked arm would continue to press.
             along: Number of parts of earlier convergences in which the readings moved with the command, int [D].
         """
         self.at_once = np.broadcast_to(np.asarray(at_once, bool), commanded.shape)

@@ -28,7 +28,7 @@ def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: i
 
     Raises:
         BenchError: If `positions` has another form, is outside the area or has block and plate closer than APART_M, if
-        `blocks` is below 1 or does not fit, or if the seed is negative.
+            `blocks` is below 1 or does not fit, or if the seed is negative.
     """
     block, plate = _parse_positions(positions or {})
     if blocks < 1 or seed < 0:

@@ -170,7 +170,7 @@ class RtcPrefix:
             delays: recent measured delays [control steps]; if empty, the delay of the newest chunk is used.
             quantile: quantile of `delays` that is predicted, in rows, rounded up.
             execution_horizon: number of steps [control steps] of the response that will be executed; None: the whole
-            chunk. The present plan does not depend on it.
+                chunk. The present plan does not depend on it.
             observation: reference of rows that are not absolute, as for the response; required for such rows.
         """
         self.warning, self.predicted_delay = "", 0
