@@ -79,7 +79,7 @@ def datasets(request: HttpRequest) -> Any:
 
 @router.get("/one", response={200: DatasetOut, **FAILURES}, summary="One dataset", url_name="dataset")
 def dataset(request: HttpRequest, name: str) -> Any:
-    """Return a dataset by its name; `cups` is datasets/cups."""
+    """Return a dataset by its name; for a dataset in the folder `datasets/`, the name without `datasets/` is enough."""
     return DatasetOut.of(overview(dataset_orders.full_name(name)))
 
 

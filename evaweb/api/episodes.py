@@ -44,7 +44,10 @@ _WITH = ("station", "trial__checkpoint", "trial__handout", "trial__verdict", "de
 
 
 class DamageOut(Schema):
-    """One file that differs from the recorded one; `rows` and `times` [s] are the first and last affected."""
+    """One file that differs from the file as it was recorded.
+
+    `rows` and `times` [s] are stretches of the recording that are affected: the first and the last row or time of each.
+    """
 
     file: str
     what: str

@@ -192,7 +192,9 @@ class CamerasIn(Body):
 
 
 class ReferenceIn(Body):
-    """Scene and position that the references belong to; without a scene they identify the cameras themselves."""
+    """Scene and position that the references belong to; without a scene, the references identify the station's
+    cameras.
+    """
 
     scene: str | int | None = None
     position: int | None = None

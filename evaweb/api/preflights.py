@@ -62,7 +62,10 @@ class PreflightOut(Schema):
 
 
 class PreflightIn(Body):
-    """Checkpoint, by name or id, and the station whose deployment is used; without one, the first that supports it."""
+    """Checkpoint, by name or id, and the station whose deployment is used.
+
+    Without a station, the first one that supports the checkpoint is used.
+    """
 
     checkpoint: str | int
     station: Annotated[str, Field(max_length=63)] = ""

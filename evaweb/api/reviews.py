@@ -105,7 +105,9 @@ class LabelOut(Schema):
 class EpisodeReviewsOut(Schema):
     """Reviews (newest first), segments (in order) and quality report of an episode.
 
-    `covered` counts those of others that are hidden from a caller who may still have to judge its trial.
+    `covered` is the number of other people's reviews and segments that are hidden from the caller, who may still have
+    to
+    judge the trial.
     """
 
     verdict: ReviewOut | None

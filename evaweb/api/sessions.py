@@ -49,7 +49,12 @@ class SessionOut(Schema):
 
 
 class CountsOut(Schema):
-    """Numbers of episodes: `saved` are complete and not discarded, also counted by result; `cut` ended in a fault."""
+    """Numbers of episodes of a session.
+
+    `saved` are complete and not discarded; they are the sum of `success`, `partial`, `fail` and `unlabelled`. `cut`
+    ended
+    in a fault.
+    """
 
     saved: int
     success: int
@@ -170,7 +175,9 @@ class QueuedOut(JobOut):
 
 
 class QueueOut(Schema):
-    """Failed, running and waiting jobs of a session's episodes; `left_s` is the time for the latter two."""
+    """Failed, running and waiting jobs of a session's episodes; `left_s` is the estimated time until none runs or
+    waits.
+    """
 
     done: int
     total: int

@@ -190,7 +190,10 @@ class CommandOut(Schema):
 
 
 class EStopIn(Schema):
-    """Reason of a press; the same uuid again is the same press. No content makes a press invalid."""
+    """Reason of a press of the e-stop.
+
+    A request that repeats a uuid is the same press. A press is valid whatever the request contains.
+    """
 
     uuid: UUID | None = None
     why: str = "pressed"
@@ -276,7 +279,7 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     """Send a command: set-up, run, stop, modes, strategy, motions, grippers.
 
-    The same uuid again gets the first answer.
+    A request that repeats a uuid is not carried out again; it gets the first answer.
     """
     target, visibility = selectors.station_get(name=name), visibility_for_request(request)
     order = given.model_dump(exclude=set(_NAMED))

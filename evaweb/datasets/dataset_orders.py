@@ -62,7 +62,7 @@ class Repair(_Order):
 
 
 class Convert(_Order):
-    """Order to write a dataset as a new one of that version; features may get new names."""
+    """Order to write a copy of a dataset in another version of the format; features may get new names."""
 
     what: Literal["convert"]
     dataset: Name
