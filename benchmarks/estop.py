@@ -158,7 +158,11 @@ def _interruption(station: Station) -> str:
 
 @contextmanager
 def _under(lab_bench: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
-    """Run the attack within the context; afterwards the yielded map has the attacker's counts."""
+    """Run the attack `attack` with the relative strength `share` while the context is open.
+
+    The context yields a map. When the context has ended, the map contains what the attacker has counted. With the
+    attack "none" the map stays empty.
+    """
     did: dict[str, int] = {}
     if attack == "none":
         yield did

@@ -336,7 +336,10 @@ def _written(rows: Sequence[Any]) -> list[Any]:
 
 
 def _counted(plan: Any) -> None:
-    """Let each trial's only score be its verdict, in one statement for speed."""
+    """Mark each trial of the plan as scored, with the trial's only score as its verdict.
+
+    This is done in one SQL statement, because it is faster.
+    """
     from django.db import connection
 
     with connection.cursor() as cursor:

@@ -219,7 +219,10 @@ class _Jaws:
         return link, np.linalg.inv(at[link]) @ np.append(end, 1.0)
 
     def _partings(self, fingers: Mapping[str, tuple[float, float]]) -> list[float]:
-        """Return for each pair of branches how much it parts between the limits [m]."""
+        """Return the distance [m] by which each pair of finger branches moves apart between the two limits.
+
+        `fingers` has for each finger joint its values at the lower and at the upper limit of the gripper.
+        """
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
         displacements = [
             self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs

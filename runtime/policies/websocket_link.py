@@ -216,7 +216,10 @@ class WebsocketLink:
             raise PolicyError(_CLOSED_BY_US(url=self._url))
 
     def close_gracefully(self) -> None:
-        """Send a close frame, without which servers print a traceback, and close, both in a thread of its own."""
+        """Send a close frame and close the connection, in a separate thread, without waiting for it.
+
+        Without a close frame, servers print a traceback.
+        """
         self._watchdog.stop()
         connection, self._connection = self._connection, None
         resources = self._stack.pop_all()

@@ -74,7 +74,7 @@ class Preflights:
 
     @property
     def current(self) -> str:
-        """Subject of the running preflight, "" if none is running."""
+        """Name of what the running preflight is about, "" if no preflight is running."""
         return self._flight.about if self._flight else ""
 
     def start(self, asked: PreflightRequest, resolved: Resolved) -> float:

@@ -79,7 +79,8 @@ class _TickingClock(Clock):
 class ServedLockstep(Lockstep):
     """Lockstep station with sockets; call `serve`, then `close`.
 
-    Raises SetupError if another process has the station, or if it needs something that lockstep lacks.
+    Raises SetupError if another process has locked the station, or if the deployment needs something that lockstep
+    lacks.
     """
 
     def __init__(

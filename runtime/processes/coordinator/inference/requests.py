@@ -61,7 +61,7 @@ class MissBound:
     jump: float
 
     def misses(self, solved: IkResult) -> NDArray[np.bool_]:
-        """Return which poses have a larger position or rotation error, bool [T, arms]."""
+        """Return the poses whose position or rotation error exceeds its bound, as bool [T, arms]."""
         over: NDArray[np.bool_] = (solved.position_error > self.position) | (
             solved.rotation_error > self.rotation
         )
