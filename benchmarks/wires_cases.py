@@ -129,7 +129,10 @@ def absent(case: Case) -> str:
 
 @contextlib.contextmanager
 def process(command: Sequence[str], *descriptors: int) -> Iterator[subprocess.Popen[str]]:
-    """Yield a process that ends when its standard input is closed, at the end of the context."""
+    """Start a process and yield it; at the end of the context, close its standard input, on which it ends.
+
+    The process inherits the file descriptors `descriptors`.
+    """
     child = subprocess.Popen(
         command,
         cwd=ROOT,

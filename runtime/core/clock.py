@@ -61,7 +61,10 @@ class VirtualClock(Clock):
 
 
 class _StepCandidate(NamedTuple):
-    """Sequence of equally late messages that follow a message that was less late: a possible clock step back."""
+    """Possible step of a peer's clock back, recognised by messages that are suddenly later than before.
+
+    The candidate is a sequence of messages that are equally late, after a message that was less late.
+    """
 
     first: float  # arrival of the first late message
     since: float  # arrival of the first of the equally late messages

@@ -185,9 +185,10 @@ class WebsocketLink:
             return self._receive(connection, deadline, _AN_ANSWER, seconds)
 
     def exchange_ack(self, request: bytes, seconds: float, text: str) -> bytes | None:
-        """Return the response to `request` as bytes; None if it is the acknowledgement `text`, which some servers send.
+        """Return the response to `request` as bytes; None if the response is the acknowledgement `text`.
 
-        Any other text raises an error of the server, as every text does in `exchange`.
+        Some servers send such an acknowledgement as a text frame. Every other text frame is an error message of the
+        server, and raises the same errors as in `exchange`.
         """
         connection = self._connection
         if connection is None:

@@ -128,7 +128,10 @@ class Actuator(ABC):
         self.velocity, self._ends = np.zeros(len(self.commanded)), None
 
     def snap_grippers(self) -> None:
-        """Snap the command of binary grippers, which may have been engaged between open and closed."""
+        """Snap the command of each binary gripper to open or closed.
+
+        The robot may have been engaged with a command between open and closed.
+        """
         self.commanded = snap_grippers(self._settings.switches, self.commanded, self.commanded)
 
     def rebase_command(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:

@@ -343,7 +343,9 @@ class CommandPipeline:
     def _check_joints_returned(
         self, run: ExecuteChunks, step: int, planned: float, observation: LatestObservation
     ) -> None:
-        """Discard the plan if joints are measured again after a gap in which it moved on without the robot."""
+        """Discard the plan if joints are measured again after a gap, and the plan has moved on without the robot
+        meanwhile.
+        """
         state = self.actuator.state(observation, planned, None)
         if (
             not self._safety.unseen(state)

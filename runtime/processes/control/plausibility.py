@@ -453,7 +453,10 @@ class _LastDigitActivity:
 
 
 class _FrozenJointDetector:
-    """Detector of a joint with a constant number, under fresh stamps, while its command moves."""
+    """Detector of a joint whose reading stays at the same number while its command moves.
+
+    The stamps of the readings advance meanwhile, so that the readings look fresh.
+    """
 
     def __init__(self, limits: Limits) -> None:
         dim = len(limits.names)

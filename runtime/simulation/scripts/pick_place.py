@@ -219,7 +219,7 @@ class PickPlaceEpisode:
         return self._route
 
     def _distances(self, q: Float64) -> Float64:
-        """Return the distances [rad] of joints [D] from the rows of the present leg."""
+        """Return the distance [rad] of the joints `q` [D] from each row of the present leg of the route."""
         return self._apart(self._on().legs[self._leg].rows, q)
 
     def _apart(self, rows: Float64, q: Float64) -> Float64:

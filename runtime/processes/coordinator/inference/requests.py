@@ -153,8 +153,8 @@ class PolicyRequests:
     def end_episode(self) -> None:
         """End the rollout on the policy's server, without waiting.
 
-        A failure is logged. In that case the policy ends the rollout before its next request, or fails then with the
-        reason.
+        A failure is only logged. The policy then ends the rollout before its next request; if that fails too, the
+        request fails with the reason.
         """
         policy, self._fresh = self.policy, True
 
