@@ -366,11 +366,12 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
 
 
 def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
-    """Return the largest error found, and the common rates at start, middle and end with which it occurs.
+    """Search for the drift of success rates with which wrong findings are most probable.
 
-    The rate of both checkpoints changes piecewise linearly in time. Each rate is represented by the angle whose squared
-    sine is the rate. The search begins with straight lines from a grid of angles, then varies the three angles of the
-    best course so far, in ever finer steps.
+    Return the largest error probability found, and the common rates at start, middle and end with which it occurs. The
+    common rate of both checkpoints changes piecewise linearly in time. Each rate is represented by the angle whose
+    squared sine is the rate. The search begins with straight lines from a grid of angles, then varies the three angles
+    of the best course so far, in ever finer steps.
     """
     angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
     lines = [(start, (start + end) / 2, end) for start, end in product(angles, repeat=2)]

@@ -72,7 +72,11 @@ class Bench:
 
 
 def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
-    """Measure `WAY_p99_ms.ATTACK` for each way of pressing, lost presses, and whether station and web still run."""
+    """Measure e-stop presses during each attack, and return the figures.
+
+    The figures `WAY_p99_ms.ATTACK` are the delays, where WAY is one of WAYS, the ways of pressing. Further figures
+    count lost presses, and show whether station and web still run.
+    """
     rows = []
     for attack in attacks:
         with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as lab_bench:

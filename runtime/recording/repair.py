@@ -212,7 +212,8 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 def _unproven(path: Path, closed: bool) -> str:
     """Return a sentence if the episode had been closed before, so that facts about its end are lost; "" if not.
 
-    It had been closed if there is an export of it, or if all its tables have an end mark, as `closed` states.
+    The episode had been closed if there is an export of it, or if `closed` is True, which states that all its tables
+    have an end mark.
     """
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None

@@ -253,7 +253,7 @@ class RobotActuator(Actuator):
     def _unwrapped_joints(self, observation: LatestObservation) -> Float64:
         """Return the measured joints [D]; wrapping angles are shifted by whole turns to be nearest to the last command.
 
-        The node may not count turns.
+        The shift is necessary because some nodes do not count turns.
         """
         wrapping = self._settings.dims.wrapping
         if not wrapping or not self.engaged:
