@@ -81,7 +81,10 @@ _OVER = ("scored", "voided", "abandoned")
 
 
 def counted(acts: Iterable[Act], found: DataAtEnd) -> dict[str, list[str]]:
-    """Return the faults by figure: everything that was lost, exists twice or remained unfinished."""
+    """Return the faults by name of the figure that counts them.
+
+    A fault is anything that was acknowledged and is lost, that exists twice, or that remained unfinished.
+    """
     acts = list(acts)
     runs = {act.episode: act for act in acts if act.kind == "run" and act.uuid not in found.unopened}
     scores = {act.uuid for act in acts if act.kind == "score"}

@@ -30,7 +30,10 @@ _STATION_BYTES = 500e6  # memory per additional station, with its robot
 
 @dataclass(frozen=True, slots=True)
 class _Rung:
-    """Measured step with `count` stations or pages: delays of presses and pages, and processor load."""
+    """Step of the climb, measured with `count` stations or with `count` viewers.
+
+    It has the delays of e-stop presses and of viewers' pages, and the load of the processors.
+    """
 
     count: int
     estop_p99_ms: float

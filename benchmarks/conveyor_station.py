@@ -117,7 +117,10 @@ class ScriptPolicy(Policy):
 
 
 def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> tuple[Conveyor, Lockstep]:
-    """Return the conveyor with the motion that `seed` decides, and a station with it that records nothing."""
+    """Return a conveyor, and a station in lockstep whose robot is at this conveyor.
+
+    `seed` decides the motion of the belt. The station records nothing.
+    """
     tree: dict[str, Any] = {
         "station": "conveyor",
         "robot": "agilex_piper",

@@ -112,7 +112,11 @@ def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
 def _rate(
     interval: Callable[[int, int], Interval | None], fixed: float | None = None, allowed: str = _WANTED
 ) -> Case:
-    """Return the case of successes of one checkpoint whose rate is `fixed`, or uniform random."""
+    """Return the case in which the success rate of one checkpoint is estimated by `interval`.
+
+    The true rate is `fixed`, or drawn uniformly from 0 to 1 if `fixed` is None. `allowed` is the requirement on the
+    coverage, "" if the coverage is only reported.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         truth = chance.random() if fixed is None else fixed
@@ -137,9 +141,10 @@ def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, a
 
 
 def _anytime(first: float, second: float) -> Case:
-    """Return the case of successes of two checkpoints in pairs.
+    """Return the case in which two checkpoints are compared by the successes in pairs of trials.
 
-    Its interval has to contain the truth after every pair, because what it once excludes stays excluded.
+    `first` and `second` are the success rates of the checkpoints. The interval of this case has to contain the true
+    difference after every pair, because what the interval once excludes stays excluded.
     """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:

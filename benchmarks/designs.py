@@ -226,7 +226,10 @@ def estimates(rows: Courses) -> Iterator[Figure]:
 
 
 def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, int], float]]:
-    """Yield every table at which the design ends (successes and trials of both arms), with the table's probability."""
+    """Yield each result with which the design can end, with the probability of that result.
+
+    A result is the number of successes and of trials of the first arm, followed by those of the second arm.
+    """
     pairs = exact.looks[-1].first
     alive = np.zeros((pairs + 1, pairs + 1))
     alive[0, 0] = 1.0
@@ -284,9 +287,10 @@ def _in_random_order(blocks: int) -> list[Unit]:
 
 
 def families(rows: Courses) -> Iterator[Figure]:
-    """Yield how often any of several comparisons of equal checkpoints is significant, with and without dropping.
+    """Yield figures of how often equal checkpoints are found to differ when several comparisons are planned.
 
-    This is simulated; three standard errors above alpha are allowed.
+    A run counts if any of its comparisons is significant. One figure is for a design that drops checkpoints, the others
+    are for designs that drop none. The shares are simulated, so a figure may exceed alpha by three standard errors.
     """
     three = ((0, 1), (0, 2), (1, 2))
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
@@ -362,11 +366,12 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
 
 
 def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
-    """Return the largest error found, and the common rates at start, middle and end with which it occurs.
+    """Search for the drift of success rates with which wrong findings are most probable.
 
-    The rate of both checkpoints changes piecewise linearly in time. Each rate is represented by the angle whose squared
-    sine is the rate. The search begins with straight lines from a grid of angles, then varies the three angles of the
-    best course so far, in ever finer steps.
+    Return the largest error probability found, and the common rates at start, middle and end with which it occurs. The
+    common rate of both checkpoints changes piecewise linearly in time. Each rate is represented by the angle whose
+    squared sine is the rate. The search begins with straight lines from a grid of angles, then varies the three angles
+    of the best course so far, in ever finer steps.
     """
     angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
     lines = [(start, (start + end) / 2, end) for start, end in product(angles, repeat=2)]

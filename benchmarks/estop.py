@@ -72,7 +72,11 @@ class Bench:
 
 
 def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
-    """Measure `WAY_p99_ms.ATTACK` for each way of pressing, lost presses, and whether station and web still run."""
+    """Measure e-stop presses during each attack, and return the figures.
+
+    The figures `WAY_p99_ms.ATTACK` are the delays, where WAY is one of WAYS, the ways of pressing. Further figures
+    count lost presses, and show whether station and web still run.
+    """
     rows = []
     for attack in attacks:
         with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as lab_bench:
@@ -158,7 +162,11 @@ def _interruption(station: Station) -> str:
 
 @contextmanager
 def _under(lab_bench: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
-    """Run the attack within the context; afterwards the yielded map has the attacker's counts."""
+    """Run the attack `attack` with the relative strength `share` while the context is open.
+
+    The context yields a map. When the context has ended, the map contains what the attacker has counted. With the
+    attack "none" the map stays empty.
+    """
     did: dict[str, int] = {}
     if attack == "none":
         yield did

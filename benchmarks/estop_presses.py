@@ -133,7 +133,13 @@ class RestPresser:
         return Press(reply.get("status", "refused") if in_time else "", str(reply)[:200], took * 1000.0)
 
     def post(self, method: str, what: str, body: str = "") -> dict[str, Any]:
-        """Return the answer to a request to `estop` or `commands`."""
+        """Send an HTTP request to the station's address in the REST interface; return the answer.
+
+        Args:
+            method: HTTP method.
+            what: Last part of the address, `estop` or `commands`.
+            body: Body of the request.
+        """
         with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
             connection.request(method, f"/api/v1/stations/{self._station}/{what}", body, self._headers)
             reply: dict[str, Any] = json.loads(connection.getresponse().read())

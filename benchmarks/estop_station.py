@@ -96,7 +96,9 @@ class Station:
         )
 
     def release(self) -> bool:
-        """Release the e-stop; return False if the coordinator does not."""
+        """Release the e-stop; return False if the station does not latch the press or does not release the latch in
+        time.
+        """
         try:
             self.client.wait(lambda status: status["state_is"]["latched"], _RELEASE_S)
             self.client.command("release")

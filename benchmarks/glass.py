@@ -114,7 +114,10 @@ def _ages_ms(stamps: Mapping[int, float], shown: Mapping[int, float]) -> np.ndar
 
 
 def _displayed(lab: RunningLab, seconds: float) -> tuple[dict[int, float], dict[str, float]]:
-    """Open the page for `seconds`; return when it displayed each picture first, by number, and the processor load."""
+    """Open the page for `seconds`, and record which pictures it displays.
+
+    Return the time at which each picture was displayed first, by the number of the picture, and the processor load.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -119,7 +119,11 @@ class _Call(NamedTuple):
 
 
 def _enough(calls: Sequence[_Call], chunks: int, seconds: float) -> bool:
-    """Return True if a backend has used its time and solved each chunk often enough."""
+    """Return True if the calls of a backend are sufficient for the measurement.
+
+    They are if they took at least `seconds` in total, with at least _FEWEST calls per chunk. For a slow backend, one
+    call per chunk is sufficient once the calls took _PATIENCE_S.
+    """
     took = sum(call.took for call in calls)
     if len(calls) < _FEWEST * chunks:
         return len(calls) >= chunks and took >= _PATIENCE_S

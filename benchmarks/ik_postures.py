@@ -82,9 +82,9 @@ def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Floa
 
 
 def worst(robot: Robot, kinematics: Kinematics, joints: Float64, rows: int | None = None) -> Float64:
-    """Return the largest position error along a joint path [T, D], m [arms].
+    """Return the largest position error [m] of each arm along a joint path [T, D], as [arms].
 
-    The path is solved in chunks of `rows`, or in one chunk.
+    The path is solved in chunks of `rows` rows; in a single chunk if `rows` is None.
     """
     targets = kinematics.forward(joints)
     missed: Float64 = followed(kinematics, robot, targets, joints[0], rows or len(joints)).position_error.max(

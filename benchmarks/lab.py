@@ -162,7 +162,10 @@ def _idle(processes: Mapping[str, psutil.Process], seconds: float) -> dict[str, 
 
 
 def _presses(running: RunningLab, seconds: float) -> list[Press]:
-    """Press from an open page, in both ways at once, repeatedly for `seconds`; return the presses."""
+    """Press from an open page, repeatedly for `seconds`; return the presses.
+
+    Each press is sent in both ways at once: over the page's websocket, and to the process for stops.
+    """
     pressed: list[Press] = []
     page = OpenPage(running.visitor, running.announced["stops"])
     until = time.monotonic() + seconds

@@ -175,7 +175,11 @@ def _shortest_delay(endpoint: str) -> float:
 
 
 def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[str, Any]:
-    """Return latencies from the recording [ms]: arrays, or percentiles if only percentiles are recorded."""
+    """Return the latencies [ms] that can be computed from the recording.
+
+    `node_ms` is an array of the single values. The other entries are percentiles, because only these are recorded; the
+    shortest time from the node to the station, `transit` [s], is added to them.
+    """
     assert episode.outcome is not None
     outcome: Mapping[str, Any] = episode.outcome
     muxed = outcome["muxed_ms"].values()

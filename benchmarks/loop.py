@@ -112,7 +112,7 @@ def _run(
 
 
 def _sleeper(arguments: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
-    """Start a comparison loop as a process."""
+    """Start a process that runs one of the loops with which the control loop is compared."""
     command = [sys.executable, "-m", "benchmarks.sleeper", *arguments]
     return subprocess.Popen(command, cwd=ROOT, env=dict(environment), stdout=subprocess.PIPE, text=True)
 

@@ -1,7 +1,8 @@
-"""Pairs until partial credit separates two policies: our e-process and NSCORE's supermartingale, on the same pairs.
+"""Number of pairs after which partial credit separates two policies, with two methods on the same pairs.
 
-NSCORE (Snyder et al.) is not part of the product, and requires cvxpy and matplotlib: it runs in a separate environment,
-which is created by hand. Without that environment NSCORE is not measured.
+The methods are our e-process and NSCORE's supermartingale. NSCORE (Snyder et al.) is not part of the product, and
+requires cvxpy and matplotlib: it runs in a separate environment, which is created by hand. Without that environment
+NSCORE is not measured.
 
   python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
 """

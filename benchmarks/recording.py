@@ -115,7 +115,11 @@ def figures(
 
 
 def _ratios(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Return LeRobot's processor time per recorded frame as a multiple of ours; both include writing the dataset."""
+    """Return figures that compare the cost of LeRobot's writers with the cost of ours.
+
+    They are the processor time per recorded frame in ms, and the processor time and the saving time as multiples of
+    ours. The processor time of every writer includes writing the dataset.
+    """
     (own,) = (row for row in rows if row["writer"] == "ours")
     per_frame = {row["writer"]: (row["capture_cpu_s"] + row["save_cpu_s"]) / row["frames"] for row in rows}
     ratios = [
@@ -136,7 +140,10 @@ def _made(folder: Path) -> Path:
 
 
 def _timed(part: Any, *arguments: Any) -> dict[str, Any]:
-    """Return the results of a part, with the part's duration and the machine's load at its end."""
+    """Execute `part`, one part of the benchmark, and return its results.
+
+    The duration of the part and the machine's load at its end are added to the results.
+    """
     begun = time.monotonic()
     print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # progress, because it takes minutes
     measured = part(*arguments)

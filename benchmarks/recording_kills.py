@@ -54,7 +54,10 @@ class KillCount:
     seconds: float
 
     def moments(self, seed: int, between: tuple[float, float]) -> Iterator[float]:
-        """Yield for each kill the time [s] from the begin of the activity that it interrupts."""
+        """Yield for each kill how long after the beginning of the interrupted activity the kill happens [s].
+
+        The times are drawn from the range `between`.
+        """
         drawn, begun = random.Random(seed), time.monotonic()
         for number in range(self.most):
             if number >= self.least and time.monotonic() - begun > self.seconds:

@@ -286,7 +286,7 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
 
 
 def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
-    """Create the rows for the allocation of slots to trials, in the order of the schedule."""
+    """Create the plan's hand-outs, one for each slot of the schedule with its trial, in the order of the schedule."""
     from evaweb.plans.commitment import draw_codes
     from evaweb.plans.models import Handout
 
@@ -336,7 +336,10 @@ def _written(rows: Sequence[Any]) -> list[Any]:
 
 
 def _counted(plan: Any) -> None:
-    """Let each trial's only score be its verdict, in one statement for speed."""
+    """Mark each trial of the plan as scored, with the trial's only score as its verdict.
+
+    This is done in one SQL statement, because it is faster.
+    """
     from django.db import connection
 
     with connection.cursor() as cursor:

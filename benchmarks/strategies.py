@@ -67,7 +67,10 @@ class Cell(Case):
 
     @property
     def cycle(self) -> int:
-        """Number of ticks within which everything that repeats happens at least once."""
+        """Number of ticks of a whole cycle, in which each recurring event occurs at least once.
+
+        It is the sum of horizon, delay, interval between requests, and the steps of a fade (JOIN_WINDOW).
+        """
         return self.horizon + self.delay + self.interval + JOIN_WINDOW
 
     @property
@@ -79,8 +82,10 @@ class Cell(Case):
         return parameters
 
     def loop(self, meant: IntendedRows, start: Float64, spike: int = 0) -> StepLoop:
-        """Return a step loop of the cell; the answer to request number _SLOW takes `spike` ticks instead of the
-        delay.
+        """Return a step loop with the parameters of this cell, which starts at the joints `start`.
+
+        `meant` returns the rows that the policy intends for a step. If `spike` is above 0, the answer to request number
+        _SLOW takes `spike` ticks instead of the cell's delay.
         """
         module = variants("runtime.strategies")[self.strategy]
 

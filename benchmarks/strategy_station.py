@@ -122,8 +122,9 @@ class Case:
 
 
 def compare(case: Case) -> tuple[int, int]:
-    """Return the number of the policy's actions that the station planned, and how many of them differ in the step
-    loop.
+    """Compare the actions that a station plans with those of the step loop.
+
+    Return the number of compared actions, and the number of those among them that differ.
     """
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), case)

@@ -77,7 +77,10 @@ async def _read(options: argparse.Namespace, number: int, ages: list[float]) -> 
 
 
 async def _stall(options: argparse.Namespace, number: int) -> int:
-    """Request everything, then read nothing from the connection until the time is over."""
+    """Play a viewer that stalls: request all streams, then read nothing from the connection until the time is over.
+
+    `number` distinguishes the viewers of one process.
+    """
     async with _page(options, f"stalled{number}", ping_interval=None, max_queue=1, close_timeout=1) as socket:
         await _ask(socket, options)
         socket.transport.pause_reading()

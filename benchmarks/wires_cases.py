@@ -129,7 +129,10 @@ def absent(case: Case) -> str:
 
 @contextlib.contextmanager
 def process(command: Sequence[str], *descriptors: int) -> Iterator[subprocess.Popen[str]]:
-    """Yield a process that ends when its standard input is closed, at the end of the context."""
+    """Start a process and yield it; at the end of the context, close its standard input, on which it ends.
+
+    The process inherits the file descriptors `descriptors`.
+    """
     child = subprocess.Popen(
         command,
         cwd=ROOT,
@@ -189,7 +192,7 @@ def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _ros1(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case of ROS 1 with rospy at both ends, and a separate master."""
+    """Open the case in which ROS 1 is used with rospy at both ends and with a separate master."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -237,9 +240,9 @@ def _recorded(stage: CaseSetup) -> tuple[dict[str, Any], dict[str, Path]]:
 
 
 def _mjpeg_cameras(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case of network cameras in addition to a node with minimal images.
+    """Open the case in which network cameras send the images, next to a node whose own images are minimal.
 
-    Images that arrive faster than they are decoded are skipped, so the rate is limited.
+    The rate is limited, because images that arrive faster than they are decoded are skipped.
     """
     keys = [camera.key for camera in robots.load_robot(stage.robot).cameras]
     rate, stage.hurried = str(min(stage.rate, _MOST_DECODED_HZ)), False

@@ -199,7 +199,10 @@ def _policy(protocol: Protocol, robot: Robot, url: str | None = None) -> Policy:
 
 
 def _peer(sample: Observation) -> tuple[Callable[[str], Opened] | None, str]:
-    """Return the published client with the same requests, or the reason why it is not available."""
+    """Return a function that opens the published client of openpi, and "".
+
+    That client sends the same requests as our policy. If it is not installed, return None and the reason.
+    """
     try:
         from openpi_client.websocket_client_policy import WebsocketClientPolicy
     except ImportError as error:

@@ -64,7 +64,10 @@ def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
 
 
 def main(text: str) -> None:
-    """Receive observations until the lifeline ends."""
+    """Receive observations until the lifeline ends, then print the counts of faults as JSON.
+
+    `text` is the JSON text of the fields of `Receiving`.
+    """
     heap.keep_freed_memory()
     settings = Receiving(**json.loads(text))
     robot = robots.load_robot(settings.robot)

@@ -201,15 +201,21 @@ def _birth(
 
 
 def strip_number(marks: UInt8) -> int:
-    """Return the number in the strip, which `frame_number` expects at the top of a complete image."""
+    """Return the frame number that is encoded in the strip at the top of an image.
+
+    `marks` are the parts of the image that `number_marks` returns. The strip is put on top of an empty image of full
+    size, because `frame_number` expects a complete image.
+    """
     whole = np.zeros((_LIVE[0], *marks.shape[1:]), np.uint8)
     whole[:16] = marks[:16]
     return frame_number(whole)
 
 
 def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
-    """Return the send time of the newest image with a bar of this width; widths repeat after 80 images of 640
-    pixels.
+    """Return the send time of the newest image whose number the bar in `marks` can encode.
+
+    The width of the bar encodes the number, and the widths repeat after 80 images that are 640 pixels wide. `times` has
+    the send time of each image by number. Only images that were sent until `now` are considered.
     """
     width, cycle = int((marks[-4].mean(axis=-1) > 127).sum()), marks.shape[1] // 8
     number = round((width - 1) / 8) % cycle

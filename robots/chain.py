@@ -169,7 +169,11 @@ class Chain:
         self._plain = square and bool((self._coupling == np.eye(self.size)).all()) and not self._offsets.any()
 
     def _drive(self, urdf: Urdf, joint: Joint, pinned: Mapping[str, float]) -> tuple[Float64, float]:
-        """Return row [n] and offset of a joint, whose value is row . q + offset."""
+        """Return how the vector q that drives the chain determines the value of a joint.
+
+        The value is row . q + offset; the method returns row [n] and offset. A mimic joint is followed to the joint
+        that it mimics. `pinned` has the constant values of joints that nothing drives.
+        """
         row = np.zeros(self.size)
         factor, offset = 1.0, 0.0
         names = [joint.name]

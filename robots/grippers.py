@@ -124,9 +124,11 @@ def tip_frame(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
 
 
 def _between_fingers(tree: Urdf, link: str) -> Float64:
-    """Return the frame midway between the origins of the link's sliding children, rotated only about the link's z.
+    """Return the frame of the fingertips [4, 4] relative to a link whose children slide.
 
-    Its y is the direction in which the first of them slides. It is the identity if none slides across z.
+    The origin of the frame is midway between the origins of the sliding children. The frame is rotated only about the z
+    axis of the link, so that its y axis is the direction in which the first sliding child slides. If no child slides,
+    the frame is the identity. If the first one slides along z, the frame is not rotated.
     """
     tip = np.eye(4)
     fingers = [joint for joint in tree.children(link) if joint.kind == "prismatic"]

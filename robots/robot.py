@@ -88,8 +88,10 @@ class Group:
         return _dims(self.slice.start, self.slice.stop, -1 if self.gripper is None else self.gripper.index)
 
     def carried(self, q: Float64) -> Float64:
-        """Return the pose of the start of the chain in `frame`, as transforms [..., 4, 4], for the robot's vector [...,
-        D].
+        """Return the pose of the base of the group's chain in `frame`, as transforms [..., 4, 4].
+
+        `q` is the robot's vector [..., D]. The base moves if other groups carry it; otherwise the result is the
+        identity.
         """
         if self.carrier is None:
             return np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))

@@ -209,7 +209,11 @@ def _cameras(arms: Sequence[str]) -> dict[str, str]:
 
 
 def _root_pose(tree: Urdf, limbs: Sequence[GroupGuess]) -> PoseDraft:
-    """Return the pose of the root with which the arms reach over the table: on it, or on the floor in front of it."""
+    """Return the pose that the robot's root must have so that the arms reach over the table.
+
+    The root is on the table if the shoulders are low and the robot has no wheels. Otherwise the robot stands on the
+    floor in front of the table.
+    """
     at = places(tree, {})
     shoulders: list[Float64] = [
         at[tree.joint(limb.joints[0]).child][:3, 3] for limb in limbs if limb.kind == "arm" and limb.joints

@@ -26,9 +26,10 @@ _PREFERRED = (*_GRASPS, "tool0", "ee", "tip", "flange", "hand")
 class GripperDraft:
     """Suggested gripper, whose value in messages is the position of the joint `driver`.
 
-    `fingers` are for each finger joint its values when the gripper is at `lower` and at `upper`. `apart` is the
-    distance [m] by which the fingers part from `close` to `open`, None if they do not; `tip` [7] is the frame between
-    the fingertips in the end effector. `placeholder_notes` are sentences about placeholders.
+    `fingers` has two values for each finger joint: the first when the gripper is at `lower`, the second when it is at
+    `upper`. `apart` is the distance [m] by which the fingers part from `close` to `open`, None if they do not. `tip`
+    [7] is the pose of the frame between the fingertips, in the frame of the end effector. `placeholder_notes` are
+    sentences about placeholders.
     """
 
     driver: str
@@ -70,9 +71,9 @@ def _hand(tree: Urdf, limb: GroupGuess, last: str) -> str:
 def guess_gripper(
     tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]
 ) -> GripperDraft:
-    """Return the gripper of an arm with fingers.
+    """Return the suggested gripper of an arm with fingers.
 
-    `corners` [n, 3] are those of the links that have real shapes.
+    `corners` has the corners [n, 3] of the shapes of each link, for the links that have real shapes.
     """
     followed = tree.masters()
     driver = tree.joint(
@@ -148,9 +149,15 @@ class _Jaws:
     def closing_values(
         self, driver: str, ends: tuple[float, float], others: Mapping[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
-        """Return the values of every finger joint at the driver's lower and upper limit.
+        """Return the values of every finger joint when the driver is at its lower and at its upper limit.
 
-        Of the possible directions of the other fingers those are chosen in which the fingers part most.
+        A URDF does not say in which direction the other fingers move when the driver moves. The directions are chosen
+        with which the fingers part most.
+
+        Args:
+            driver: Joint whose position is the gripper's value.
+            ends: Lower and upper limit of the driver.
+            others: Lower and upper limit of each finger joint that moves independently of the driver.
         """
         choices = [
             {driver: ends} | dict(zip(others, turned, strict=True))
@@ -219,7 +226,10 @@ class _Jaws:
         return link, np.linalg.inv(at[link]) @ np.append(end, 1.0)
 
     def _partings(self, fingers: Mapping[str, tuple[float, float]]) -> list[float]:
-        """Return for each pair of branches how much it parts between the limits [m]."""
+        """Return the distance [m] by which each pair of finger branches moves apart between the two limits.
+
+        `fingers` has for each finger joint its values at the lower and at the upper limit of the gripper.
+        """
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
         displacements = [
             self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs

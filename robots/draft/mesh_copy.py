@@ -210,7 +210,12 @@ def _names(file: Path) -> Iterator[str]:
 
 
 def _places(source: Path, named: str) -> Iterator[Path]:
-    """Yield paths at which a mesh of the URDF `source` may be: next to it, or in its package above it or next to it."""
+    """Yield the paths at which a mesh of the URDF `source` may be, whose name in the URDF is `named`.
+
+    A name without a scheme is relative to the folder of the URDF, and a file URL is a path. In a package URL, the
+    package may be a folder that contains the URDF, or a folder in one of these. The rest of the URL may also be
+    relative to the folder of the URDF.
+    """
     scheme, separator, path = named.partition("://")
     folder = source.resolve().parent
     if not separator:

@@ -94,12 +94,12 @@ class LeasedStation:
             raise RuntimeFault(f"set-up failed: {status['reason']}")
 
     def run(self) -> dict[str, Any]:
-        """Start a run and wait for its end, successful or not; return the status then."""
+        """Start a run and wait for its end, successful or not; return the station's status after the end."""
         self._client.command("run")
         return self.wait_for(lambda s: not s["state_is"]["going"], math.inf, "the end of the run")
 
     def wait_until_closed(self) -> dict[str, Any]:
-        """Wait until the recording, if there is one, is on disk; return the status then."""
+        """Wait until the recording, if there is one, is on disk; return the station's status after that."""
         status = self.poll_status()
         if self.opened:
             status = self.wait_for(lambda _: self.closed, _CLOSE_S, "the end of the recording")

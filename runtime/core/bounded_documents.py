@@ -49,8 +49,10 @@ def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]
 def load_toml(path: Path, what: str) -> dict[str, Any]:
     """Return the table in a TOML file.
 
+    `what` is the name of the file in messages.
+
     Raises:
-        UnreadableDocument: it is no regular file, or as in `parse_toml`; `what` is its name in the message.
+        UnreadableDocument: the file is no regular file, or its text is too large, too deep or invalid.
         OSError: the file cannot be read.
     """
     status = path.stat()

@@ -61,7 +61,10 @@ class VirtualClock(Clock):
 
 
 class _StepCandidate(NamedTuple):
-    """Sequence of equally late messages that follow a message that was less late: a possible clock step back."""
+    """Possible step of a peer's clock back, recognised by messages that are suddenly later than before.
+
+    The candidate is a sequence of messages that are equally late, after a message that was less late.
+    """
 
     first: float  # arrival of the first late message
     since: float  # arrival of the first of the equally late messages
@@ -157,9 +160,11 @@ class ClockStepDetector:
         return max(_LEAST_S, 3.0 * sorted(self._noise)[len(self._noise) * 9 // 10])
 
     def _off_more(self, moved: float, waited: float) -> float:
-        """Return the stamp's distance from the stream's period, minus that of the arrival [s].
+        """Return by how much more the stamp is out of the stream's period than the arrival [s].
 
-        `moved` is the interval since the previous stamp, `waited` that since the previous arrival [s].
+        Each of the two intervals is compared with the nearest multiple of the period: `moved` is the interval since the
+        previous stamp, `waited` the interval since the previous arrival [s]. The result is the distance of `moved`
+        minus the distance of `waited`.
         """
         period = max(sorted(self._intervals)[len(self._intervals) // 2], _LEAST_S / 10)
         return _off(moved, period) - _off(waited, period)

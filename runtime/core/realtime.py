@@ -123,7 +123,8 @@ def _class(libc: ctypes.CDLL, priority: int, locked: bool, below: int = 0) -> st
 def _fifo(priority: int, below: int = 0) -> str:
     """Enter SCHED_FIFO and return the class, "" if not permitted.
 
-    The priority is `below` less than that of a process that requests `priority` itself.
+    A process that passes `below` gets a priority that is lower by this number than the priority of a process that
+    passes the same `priority` alone. If `priority` exceeds the permitted limit, the limit takes its place.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     for candidate in (priority - below, min(priority, limit) - below):

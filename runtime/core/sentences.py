@@ -185,7 +185,10 @@ def from_wire(text: str, id: object, arguments: object, depth: int = 0) -> str:
 
 
 def checked(said: object) -> dict[str, dict[str, Any]]:
-    """Return ids and arguments by path, as another process sent them in `said`, without invalid entries."""
+    """Return the ids and arguments of sentences that another process has sent, by the path of each text.
+
+    `said` is what the process has sent. Entries that are invalid are left out.
+    """
     said = said if isinstance(said, Mapping) else {}
     sentences = {path: _checked(entry) for path, entry in said.items() if isinstance(entry, Mapping)}
     return {str(path): entry for path, entry in sentences.items() if entry}

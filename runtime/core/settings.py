@@ -76,7 +76,11 @@ def _sentence(
 
 
 def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
-    """Return the key as in the file, without the tags that pydantic adds for unions."""
+    """Return the key of a setting as the file has it, from `loc`, the location that pydantic reports.
+
+    pydantic adds tags to the location where a setting is a union of models; the tags are left out. `tree` are the
+    tables of the file.
+    """
     key: list[str] = []
     at: Any = tree
     for index, part in enumerate(loc):

@@ -565,9 +565,10 @@ def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
 
 
 def _is_its_own(path: Path, root: Path) -> bool:
-    """Return True if `path` is in the dataset, or in the cache to which a hub's snapshot links.
+    """Return True if `path` belongs to the dataset at `root`.
 
-    Links are resolved first.
+    A path belongs to it if, with all links resolved, it is in the dataset's folder, or in the folder of blobs to which
+    the files of a snapshot in the cache of the Hugging Face hub are links.
     """
     resolved = root.resolve()
     places = (resolved, resolved.parent.parent / "blobs")

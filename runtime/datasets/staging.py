@@ -237,7 +237,11 @@ class Staging:
             raise disk_error("publishing to", self._root, error) from error
 
     def commit(self, before: dict[str, bytes], after: dict[str, bytes]) -> None:
-        """Write the documents, sync all files, then rename them: those in `before`, the data, those in `after`."""
+        """Write the documents, sync all files, then rename them to their final names.
+
+        First the documents in `before` are renamed, then the data files, then the documents in `after`. Both arguments
+        map names to contents. Raises RecordingError if the disk refuses.
+        """
         try:
             for name, content in (before | after).items():
                 self.path(self._root / name).write_bytes(content)

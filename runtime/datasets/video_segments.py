@@ -33,7 +33,8 @@ def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
     A file that already has this form is copied unchanged.
 
     Raises:
-        NotCopyableError: The first image is no key frame, or images of other episodes are between them in coded order.
+        NotCopyableError: The first image is no key frame, or images of other episodes are stored, in coded
+            order, between the images to copy.
         RecordingError: Images are missing, or their times are too far from those of their rows.
     """
     stretch = None if span.start is None else VideoSegment(span.start, frames, fps)

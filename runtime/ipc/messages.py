@@ -62,7 +62,7 @@ class PostedChunk:
 
     Row 0 is for `observation_step`. If `requested_while_stopped`, the robot was at rest during the request (or while a
     person reviewed the chunk), and row 0 is for the first free tick. `intended_start` [D] is the position at which the
-    policy intends to begin, at any distance from the robot; None if that is row 0.
+    policy intends to begin, at any distance from the robot. If it is None, the policy intends to begin at row 0.
     """
 
     chunk_id: int
@@ -176,7 +176,7 @@ class Event:
 class BeginEpisode:
     """Request to open an episode, and for a run also to play the source from its start.
 
-    `run` 0 is a recording without a run: it has all that control does.
+    If `run` is 0, the episode is a recording without a run, which contains everything that control does meanwhile.
     """
 
     run: int

@@ -164,11 +164,11 @@ class CompiledKinematics(Kinematics):
     def _replan_missed(
         self, result: IkResult, targets: Float64, seed: Float64, dt: float, reference: Float64, row: int
     ) -> None:
-        """Replan in `result` the arms that reach the first pose and miss a later one, or that end near limits.
+        """Replan in `result` the arms that reach the first pose but miss a later one, or that end near limits.
 
-        The first pose is that of row `row`, the anchor's row, or of row 1 if `row` is -1 because there is no anchor.
-        `reference` are the joints [D] before the anchor's row. Ending near a limit matters because the next chunk is
-        unknown, and may continue towards the limit.
+        The first pose is the pose of the anchor's row, `row`. If there is no anchor, `row` is -1, and the first pose is
+        that of row 1. `reference` are the joints [D] before the anchor's row. Ending near a limit matters because the
+        next chunk is unknown, and may continue towards the limit.
         """
         begin = row if row >= 0 else 1
         if begin >= len(targets):

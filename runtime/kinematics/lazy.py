@@ -27,7 +27,14 @@ class LazyKinematics(Kinematics):
         aside: Callable[[Make], Future[Kinematics]],
         compiled: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Store the functions; `compiled` returns True if `make` would have nothing to compile."""
+        """Store the functions, without calling any of them.
+
+        Args:
+            forward: Forward kinematics that are used until the backend is loaded.
+            make: Builds the backend.
+            aside: Calls a function in the background and returns its future.
+            compiled: Returns True if `make` would have nothing to compile.
+        """
         self._forward = forward  # used until the backend is loaded
         self._make, self._aside, self._compiled = make, aside, compiled
         self._made: Future[Kinematics] | None = None

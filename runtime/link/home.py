@@ -124,7 +124,10 @@ class Home:
         self._store_receipt(replace(self._receipts[episode], labels=hashlib.sha256(lines).hexdigest()))
 
     def put_off(self, what: str, seconds: float) -> None:
-        """Do not offer `what` for `seconds` [s]: the uuid of an episode, or "labels UUID" for its labels."""
+        """Do not offer `what` to the lab for `seconds` [s].
+
+        `what` is the uuid of an episode, or the text "labels UUID" for the labels of that episode.
+        """
         self._put_off[what] = self._clock() + seconds
 
     # --- scan ---------------------------------------------------------------------------------------------------

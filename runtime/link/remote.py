@@ -34,7 +34,7 @@ class Pending:
 class PendingPress:
     """Press of the e-stop that waits for the link.
 
-    `told`: its sender has an answer already, but the press is still sent.
+    `told` is True if the sender of the press has received an answer already. The press is still sent to the station.
     """
 
     call: IncomingMessage

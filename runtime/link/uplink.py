@@ -53,7 +53,10 @@ class Telling:
 
 
 def read_uplink(endpoints: Endpoints) -> dict[str, Any] | None:
-    """Return lab, since and why as a dict for JSON; None if the station has no link to a lab."""
+    """Return the state of the link as a dict for JSON; None if the station has no link to a lab.
+
+    The keys are those of `Uplink`: "lab", "since" and "why".
+    """
     try:
         endpoint = endpoints.read(UPLINK)
         fields = {"lab": str(endpoint["lab"]), "since": float(endpoint["since"]), "why": str(endpoint["why"])}

@@ -119,7 +119,10 @@ class Credit:
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Newest messages of streams, one part each."""
+    """Newest message of each of the streams `streams`.
+
+    The messages follow as parts of the ZMQ message, one for each stream, in the order of `streams`.
+    """
 
     streams: list[str]
 
@@ -159,7 +162,10 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """Confirmation that the lab has verified an episode or labels; `digest` is of the offered list or of the lines."""
+    """Confirmation that the lab has verified an episode or the labels of an episode.
+
+    `digest` is the digest of the offered list of files, or of the lines of the labels.
+    """
 
     episode: str
     digest: str

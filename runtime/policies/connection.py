@@ -27,11 +27,18 @@ def open_connection(
 ) -> socket.socket:
     """Return a connection as `connect_any` does, with errors that name `url`.
 
-    `seconds` [s] is the time allowed for connecting, as errors state it.
+    Args:
+        url: Address of the policy server, for messages.
+        host: Name or address.
+        port: TCP port.
+        deadline: Time limit on the monotonic clock [s].
+        seconds: Time allowed for connecting [s], for messages.
+        require_wanted: Function that raises if the caller was aborted; called every few milliseconds.
 
     Raises:
         PortClosedError: The machine responds, but nothing listens on the port.
-        UnreachableError: The machine does not respond, or its name is unknown.
+        UnreachableError: The machine does not respond, its name is unknown, or the connection failed in another
+            way.
     """
     try:
         return connect_any(host, port, deadline, require_wanted)

@@ -161,7 +161,8 @@ class OpenpiPolicy(WebsocketPolicy):
     def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
         """Return the reason to suspect that this response belongs to an earlier request, "" if there is none.
 
-        In addition to the check of other policies: it arrived sooner than the inference time that it states allows.
+        The response is suspicious if it arrived sooner than the inference time that it states allows, or if the check
+        that all policies share finds a reason.
         """
         with contextlib.suppress(CodecError):  # reported by `infer`
             reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)

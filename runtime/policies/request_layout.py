@@ -119,9 +119,10 @@ class RequestLayout:
 
 
 def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
-    """Return the row format of `pose` in the space "eef", None for joints; `key` is the setting that errors name.
+    """Return the row format of `pose` in the space "eef"; None in the space "joint".
 
-    Raises ConfigurationError if the format does not fit.
+    `key` is the name of the setting in error messages. Raises ConfigurationError if the format does not fit, or is set
+    for joints.
     """
     if space == "eef":
         return PoseRows(pose, robot, f"policy.{key}")

@@ -121,7 +121,8 @@ def _pose_pairs(
 def _orientation(claimed: object, own: str) -> object:
     """Return our name for the orientation that the server calls `claimed`.
 
-    If that may be several of ours, return `own`, the deployment's, if it is one of them.
+    The server's name may stand for several of our orientations. If one of them is `own`, the orientation in the
+    deployment, `own` is returned; otherwise the first of them.
     """
     candidates = _ORIENTATIONS.get(str(claimed).lower(), (claimed,))
     return own if own in candidates else candidates[0]

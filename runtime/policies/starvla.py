@@ -191,9 +191,10 @@ class StarvlaPolicy(WebsocketPolicy):
         self._spoken = time.monotonic()
 
     def _ping_while_idle(self, silent: threading.Event, every: float) -> None:
-        """Ping until `silent` is set, if there was no request for half of `every` [s].
+        """Send pings over an idle connection until `silent` is set.
 
-        No ping is sent while a request is pending.
+        A ping is sent when there was no request for at least half of `every` [s]. No ping is sent while a request is
+        pending.
         """
         while not silent.wait(every / 2):
             if not self._lock.acquire(blocking=False):

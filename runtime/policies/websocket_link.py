@@ -185,9 +185,10 @@ class WebsocketLink:
             return self._receive(connection, deadline, _AN_ANSWER, seconds)
 
     def exchange_ack(self, request: bytes, seconds: float, text: str) -> bytes | None:
-        """Return the response to `request` as bytes; None if it is the acknowledgement `text`, which some servers send.
+        """Return the response to `request` as bytes; None if the response is the acknowledgement `text`.
 
-        Any other text raises an error of the server, as every text does in `exchange`.
+        Some servers send such an acknowledgement as a text frame. Every other text frame is an error message of the
+        server, and raises the same errors as in `exchange`.
         """
         connection = self._connection
         if connection is None:
@@ -216,7 +217,10 @@ class WebsocketLink:
             raise PolicyError(_CLOSED_BY_US(url=self._url))
 
     def close_gracefully(self) -> None:
-        """Send a close frame, without which servers print a traceback, and close, both in a thread of its own."""
+        """Send a close frame and close the connection, in a separate thread, without waiting for it.
+
+        Without a close frame, servers print a traceback.
+        """
         self._watchdog.stop()
         connection, self._connection = self._connection, None
         resources = self._stack.pop_all()

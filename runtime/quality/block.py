@@ -150,5 +150,5 @@ def unknown_joints(names: Sequence[str]) -> JointSpecs:
 
 
 def groups_of(names: Sequence[str]) -> list[str]:
-    """Return the group in each name of the form GROUP.JOINT; each group once, in their order."""
+    """Return the groups that occur in names of the form GROUP.JOINT, each group once, in the order of the names."""
     return list(dict.fromkeys(name.partition(".")[0] for name in names))

@@ -103,7 +103,10 @@ class LostCamera:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """End of an episode."""
+    """Outcome of an episode, which is written when the episode ends.
+
+    It consists of the status, the reason for the end, the time, and further `details`.
+    """
 
     status: Status
     reason: str
@@ -120,9 +123,9 @@ class Journal(ABC):
 
     @abstractmethod
     def append(self, record: Record) -> None:
-        """Record one row, tick or chunk, without waiting for an encoder or longer than one write.
+        """Record one row, tick or chunk.
 
-        Raises RecordingError.
+        The call never waits for an encoder, and takes no longer than one write. Raises RecordingError.
         """
 
     @abstractmethod

@@ -89,7 +89,7 @@ def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, An
 
 
 def smoothed_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, Any]:
-    """Return the columns of smoothed.arrow, for ticks that all have `smoothed`."""
+    """Return the columns of smoothed.arrow for `ticks`, each of which must have a `smoothed` action."""
     return {
         "step": [tick.step for tick in ticks],
         "smoothed": _vectors([tick.smoothed for tick in ticks], layout.dim),

@@ -42,15 +42,20 @@ UNPROVABLE = "its outcome is lost, and with it whether its files are as they wer
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
-    """Findings and actions of the repair of an episode, with one of these values of `verdict`:
+    """Findings and actions of the repair of an episode.
 
-    "complete": the episode has an outcome, nothing was done.
-    "restored": its outcome was restored from the copy; `problem` is the damage that the outcome had.
-    "damaged": its files do not match its outcome (`problem`); this cannot be mended, nothing was done.
-    "repaired": it has an outcome now; `problem` names facts that are lost if it had been closed before.
-    "recording": it is being written, nothing was done.
-    "unreadable": it has no usable manifest, nothing was done.
-    "failed": stopped by `problem`.
+    `verdict` is one of these:
+
+        "complete": the episode has an outcome; nothing was done.
+        "restored": the episode's outcome was restored from its copy; `problem` is the damage that the outcome
+            had.
+        "damaged": the episode's files do not match its outcome (`problem`); this cannot be mended, and nothing
+            was done.
+        "repaired": the repair has written an outcome. If the episode had been closed before, `problem` names
+            the facts about its end that are lost.
+        "recording": the episode is being written; nothing was done.
+        "unreadable": the episode has no usable manifest; nothing was done.
+        "failed": the repair was stopped by `problem`.
     """
 
     path: Path
@@ -207,7 +212,8 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 def _unproven(path: Path, closed: bool) -> str:
     """Return a sentence if the episode had been closed before, so that facts about its end are lost; "" if not.
 
-    It had been closed if there is an export of it, or if all its tables have an end mark, as `closed` states.
+    The episode had been closed if there is an export of it, or if `closed` is True, which states that all its tables
+    have an end mark.
     """
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None

@@ -113,7 +113,7 @@ class DiskWriter:
         Args:
             deadline: Longest wait, as a time of time.monotonic.
             leave: Files that stay open.
-            others: Further functions that the thread calls to write at the end.
+            others: Functions that write other files; the writer's thread calls them at the end.
 
         Returns:
             True if the thread has ended by the deadline.

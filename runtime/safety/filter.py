@@ -62,8 +62,9 @@ class SafetyVerdict:
     """Result of the checks: `action` float64 [D] may be sent, or is None if refused.
 
     `notes` are the changes, or the reason of the refusal. `largest_change_note` describes the dimension that was
-    changed most, `change` is that change [rad; a gripper's scaled by `Limits.radian_scale`]. `near_collision` is a pair
-    of links that the action brings near each other, if the settings only warn of that.
+    changed most, and `change` is the size of its change in rad. For a gripper the size is scaled by
+    `Limits.radian_scale`. `near_collision` is a pair of links that the action brings near each other, if the settings
+    only warn of that.
     """
 
     action: Float64 | None

@@ -163,7 +163,8 @@ class CommandGate:
     def _late(self, stamp: object, arrival: float) -> bool:
         """Return True if the target was sent longer ago than the deadline.
 
-        Return False if it has no stamp, or the sender's clock does not advance, because its age is then unknown.
+        Return False if the age of the target is unknown. It is unknown if the target has no stamp, or if the sender's
+        clock does not advance.
         """
         if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
             return False

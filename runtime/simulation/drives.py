@@ -25,7 +25,10 @@ _PATIENCE_S = 5.0  # wait for a node, and for the message to be sent
 
 @dataclass(frozen=True, slots=True)
 class DriveSwitch:
-    """Request to switch the drives on, which clears all faults, or off, with a `fault` as reason if there is one."""
+    """Request to switch the drives on or off.
+
+    Switching on clears all faults. `fault` is the fault with which the drives are switched off, "" for none.
+    """
 
     on: bool
     fault: str = ""

@@ -21,8 +21,8 @@ _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 class Frame:
     """Declared frame for the poses of all arms of a robot; "" means the frame that each arm declares itself.
 
-    A link is found in the copy of the URDF to which the arm belongs: each arm has its own base. Joints of other groups
-    (a torso) between that link and the arm's frame have the values of the given joints.
+    If `name` is a link, the link is found in the copy of the URDF to which the arm belongs: each arm has its own base.
+    Joints of other groups (a torso) between the link and the arm's frame have the values of the given joints.
 
     Raises:
         ConfigurationError: An unknown frame, or a link that is moved by an arm itself.
@@ -87,7 +87,11 @@ def frame_names(robot: Robot) -> list[str]:
 
 
 def _require_standing(tree: Urdf, robot: Robot, arm: Group, link: str, key: str) -> None:
-    """Raise ConfigurationError if `link` is unknown or moved by `arm`: its poses would depend on the IK solution."""
+    """Raise ConfigurationError if `link` is unknown, or if `arm` itself moves the link.
+
+    Poses in a frame that the arm moves would depend on the solution of the inverse kinematics. `key` names the setting
+    in the message.
+    """
     try:
         above = tree.between(tree.root, link)
     except RobotError:

@@ -1,6 +1,6 @@
 """Codec of GR00T's messages for its stand-in: arrays are .npy files, or maps in the format of msgpack_numpy.
 
-It shares no code with the client's codec, so that it can test that.
+It shares no code with the client's codec, so that tests with the stand-in can find errors in the client's codec.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def station(
 ) -> ServedLockstep:
     """Return the station of a deployment with its bench; `bench_options` are options of a simulated node.
 
-    If `paced`, it is at most as fast as real time, and success does not end a run.
+    If `paced`, virtual time runs at most as fast as real time, and the success of the task does not end a run.
 
     Raises:
         RuntimeFault: If the deployment is invalid, or its bench is not possible.

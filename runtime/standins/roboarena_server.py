@@ -63,7 +63,10 @@ class RequestLog:
 
 
 class RoboarenaServer(WebsocketServer):
-    """Server on loopback; plays `script`, or a gesture by default. `heard` logs requests for tests."""
+    """Stand-in for a RoboArena server, which listens on loopback.
+
+    The server plays `script`; without a script it plays a gesture. `heard` is a log of the requests, for tests.
+    """
 
     def __init__(
         self, robot: Robot, arena: RoboarenaBehaviour, port: int = 0, script: Script | None = None

@@ -44,7 +44,11 @@ class StarvlaBehaviour:
 
 
 class StarvlaServer(WebsocketServer):
-    """Server on loopback; plays `script`, or a gesture by default. `seen` and `pings` log requests for tests."""
+    """Stand-in for a StarVLA server, which listens on loopback.
+
+    The server plays `script`; without a script it plays a gesture. `seen` and `pings` are logs of the requests, for
+    tests.
+    """
 
     def __init__(
         self, robot: Robot, star: StarvlaBehaviour, port: int = 0, script: Script | None = None

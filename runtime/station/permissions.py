@@ -50,9 +50,9 @@ _OF_ADMINISTRATORS = ("policy", "checkpoint")
 
 
 def require(command: Command, own: Resolved) -> None:
-    """Raise RuntimeFault if the sender may not send the tables of its command; `own` is the station's deployment.
+    """Raise RuntimeFault if the command contains tables that its sender may not send.
 
-    Commands that stop the robot are never refused.
+    `own` is the station's deployment. Commands that stop the robot are never refused.
     """
     if command.kind not in _WITH_TABLES or command.role in OWN_ACCOUNT:
         return
@@ -115,7 +115,7 @@ def _recordings(own: Deployment) -> Iterable[Path]:
 def _is_recording(value: str) -> bool:
     """Return True if the path is the folder of a recording or dataset.
 
-    Other files in the data folder must not be named.
+    A policy's settings must not name any other path in the data folder, unless the deployment's [security] allows it.
     """
     path = _resolved(value)
     return (path / "manifest.json").is_file() or (path / "meta" / "info.json").is_file()

@@ -43,7 +43,10 @@ Spawn = Callable[[], "subprocess.Popen[bytes]"]
 
 @dataclass(slots=True)
 class PreflightRun:
-    """State of one preflight: running until `over` is set, then with a report in `finished` or a `failure`."""
+    """State of one preflight, which runs in a child process until `over` is set.
+
+    After that, either `finished` has the report, or `failure` is the reason why there is no report.
+    """
 
     id: str
     about: str
@@ -74,7 +77,7 @@ class Preflights:
 
     @property
     def current(self) -> str:
-        """Subject of the running preflight, "" if none is running."""
+        """Name of what the running preflight is about, "" if no preflight is running."""
         return self._flight.about if self._flight else ""
 
     def start(self, asked: PreflightRequest, resolved: Resolved) -> float:

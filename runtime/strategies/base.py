@@ -146,21 +146,25 @@ def join(
     """Merge a chunk by its strategy; fade over if it does not continue the motion, so that no strategy causes a jump.
 
     If the chunk is dropped, nothing is changed. Chunks may be merged while a fade is active: the fade then continues to
-    the new plan. The contributions of every step sum to 1; chunk id HELD is a held target. Unless `held` is given,
-    `joining` is True or the chunk is mistimed, the strategy alone decides.
+    the new plan. The contributions of every step sum to 1; the chunk id HELD in them stands for a held target.
+
+    This function adds a fade only if `held` is given, `joining` is True, or the chunk is mistimed. In all other cases
+    the strategy alone decides how the chunk is merged.
 
     Args:
         merge: The strategy's merge.
         timeline: The timeline to change.
         arrival: The chunk.
         free_step: First step not yet sent.
-        held: Target [D] that is held because nothing was planned (starvation, a distant first chunk of a run), or None.
-            The chunk takes over from it within JOIN_WINDOW steps, or within its own length if that is shorter.
+        held: Target [D] that is held because nothing was planned (starvation, a distant first chunk of a run),
+            or None. The chunk takes over from it within JOIN_WINDOW steps, or within its own length if that is
+            shorter.
         dims: Dimensions that do not blend linearly.
-        joining: True if no chunk has been merged since the kind of strategy was changed. The new plan then takes over
-            from the old plan, whose last target is held as long as needed, or from `commanded` if nothing is planned.
-            The caller passes True again until a chunk is not dropped.
-        commanded: Last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole turn.
+        joining: True if no chunk has been merged since the kind of strategy was changed. The new plan then
+            takes over from the old plan, whose last target is held as long as needed, or from `commanded` if
+            nothing is planned. The caller passes True again until a chunk is not dropped.
+        commanded: Last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole
+            turn.
     """
     placed = merge.place(timeline, arrival, free_step)
     if placed.merged.dropped:

@@ -34,8 +34,9 @@ class RtcQuery(Paced):
 
 
 class RtcMerge(OverlapMerge):
-    """Merge that uses a chunk unchanged if it contains the action executed last, at its step; otherwise it
-    blends it.
+    """Merge that uses a chunk unchanged if the chunk continues the executed actions; otherwise it blends the chunk.
+
+    A chunk continues them if its row for the step executed last is the action that was executed in that step.
     """
 
     uses_rtc = True

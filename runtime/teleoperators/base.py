@@ -57,7 +57,7 @@ class Leader(ABC):
 
     @property
     def latest_pose(self) -> LeaderPose | None:
-        """Newest pose of the leader; None before its first since `connect`."""
+        """Newest pose of the leader; None if no pose has arrived since `connect`."""
         with self._lock:
             return self._newest
 

@@ -146,11 +146,11 @@ class LeaderPolicy(Policy):
         return self._wanted
 
     def reset(self) -> None:
-        """Let the next request be a new engagement."""
+        """Forget the engagement, so that the next request engages the leader anew."""
         self._last = None
 
     def resume(self) -> None:
-        """Let the next request be a new engagement, because the robot was held or there were no observations."""
+        """Forget the engagement, because the robot was held or there were no observations."""
         self.reset()
 
     def close(self) -> None:

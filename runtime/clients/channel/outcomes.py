@@ -60,7 +60,8 @@ class Outcome:
     def accept(self, kind: str, before: Mapping[str, Any]) -> None:
         """Record that the station accepted the command `kind`.
 
-        `before` is the status before a command that continues; if it is {}, the command is already done.
+        For a long-running command, `before` is the status of the station before the command. For any other command it
+        is {}, and the command counts as done already.
         """
         self.kind, self.result, self.before = kind, "accepted" if before else "done", before
 

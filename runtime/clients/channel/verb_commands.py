@@ -63,7 +63,11 @@ class VerbContext:
             self.refuse(f"takes no argument; given {self.message.argument!r:.80}")
 
     def text_argument(self, key: str = "") -> str:
-        """Return the required argument; the message's field `key` takes precedence. Raises: UnsupportedVerb."""
+        """Return the required argument of the verb.
+
+        It is the message's field `key`, if `key` is given and the message has this field; otherwise the argument after
+        the colon. Raises: UnsupportedVerb if there is no argument.
+        """
         value = self.message.fields.get(key, self.message.argument) if key else self.message.argument
         if not isinstance(value, str) or not value.strip():
             self.refuse(f"needs {f'{key!r} in the message, or ' if key else ''}an argument after a colon")

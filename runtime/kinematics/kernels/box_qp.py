@@ -77,7 +77,11 @@ def _set_slope(box: Record, damping: float) -> None:
 
 @device_function
 def _release_bound(box: Record, damping: float) -> bool:
-    """Release the fixed variable with the largest inward slope; return True if there was one."""
+    """Release one variable that is fixed at its bound; return True if there was one to release.
+
+    The released variable is the one with the largest slope towards the inside of the box. A variable with equal bounds
+    is never released. `damping` is the damping of the step, which is part of the slopes.
+    """
     n = len(box.step)
     holding = 0
     for i in range(n):

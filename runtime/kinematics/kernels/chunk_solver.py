@@ -179,7 +179,11 @@ def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
 
 @device_function
 def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
-    """Set the bounds of a frame: joint limits and, if `dt` is above 0, how far each joint can move from `before`."""
+    """Set the bounds of the joints for one frame.
+
+    The bounds are the joint limits. If `dt` is above 0, they are also limited to what each joint can reach within `dt`
+    [s] from frame.before, the joints before this frame, which are first clipped to the joint limits.
+    """
     for i in range(len(frame.q)):
         frame.lower[i], frame.upper[i] = arm.lower[i], arm.upper[i]
         if dt > 0:

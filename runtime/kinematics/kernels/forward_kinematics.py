@@ -68,7 +68,8 @@ def compute_jacobian(
 ) -> None:
     """Write to jacobian [6, n] the derivatives of the tip's position and rotation vector with respect to q.
 
-    They are multiplied by the weights `position` and `rotation`.
+    The derivatives are multiplied by the weights `position` and `rotation`. `reach` is the scratch buffer with the
+    frames of the chain's joints and of its tip.
     """
     frames, last = reach.frames, len(chain.drive)
     for k in range(6):

@@ -78,8 +78,9 @@ def _potential_gradient(arm: Record, joint: int, frame: Record) -> float:
 def _project_nullspace(joints: int, costs: Costs, frame: Record) -> float:
     """Project both rows of frame.free to the null space; return the distance from a singularity, from 0 to 1.
 
-    The projection is free - J^T (J J^T)^-1 J free, by L D L^T: in `normal`, L D of J J^T remains below the diagonal and
-    D on it, and L transposed is written above it.
+    At a singularity the result is 0, and the rows are not projected. The projection is free - J^T (J J^T)^-1 J free. It
+    is computed by the factorisation L D L^T of the matrix J J^T in `normal`, in place: D is stored on the diagonal, L
+    transposed above it, and the product L D remains below it.
     """
     normal, jacobian, free, moved = frame.normal, frame.jacobian, frame.free, frame.moved
     set_normal_matrix(joints, costs, frame)

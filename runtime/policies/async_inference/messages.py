@@ -23,7 +23,11 @@ _LONGEST_VARINT = 10  # [bytes]
 
 
 def encode_observations(data: bytes, chunk: int = CHUNK) -> Iterator[bytes]:
-    """Yield Observation messages that carry `data`; the last is marked END, the first of several BEGIN."""
+    """Yield Observation messages that carry `data` in pieces of at most `chunk` bytes.
+
+    The state of the last message is END, that of the first message BEGIN, that of the others MIDDLE. A single message
+    is END.
+    """
     starts = range(0, len(data), chunk)
     for start in starts:
         last = start == starts[-1]

@@ -128,7 +128,10 @@ class Actuator(ABC):
         self.velocity, self._ends = np.zeros(len(self.commanded)), None
 
     def snap_grippers(self) -> None:
-        """Snap the command of binary grippers, which may have been engaged between open and closed."""
+        """Snap the command of each binary gripper to open or closed.
+
+        The robot may have been engaged with a command between open and closed.
+        """
         self.commanded = snap_grippers(self._settings.switches, self.commanded, self.commanded)
 
     def rebase_command(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
@@ -250,7 +253,7 @@ class RobotActuator(Actuator):
     def _unwrapped_joints(self, observation: LatestObservation) -> Float64:
         """Return the measured joints [D]; wrapping angles are shifted by whole turns to be nearest to the last command.
 
-        The node may not count turns.
+        The shift is necessary because some nodes do not count turns.
         """
         wrapping = self._settings.dims.wrapping
         if not wrapping or not self.engaged:

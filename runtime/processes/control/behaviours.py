@@ -128,7 +128,13 @@ class EStopHold(Behaviour):
     _SLACK = 0.05  # [rad] added to the stopping distance: lead of a command over the robot that follows it
 
     def __init__(self, position: Float64 | None, rest: Float64, captured: float = float("-inf")) -> None:
-        """Begin to hold; `captured` is the capture time of the newest joints when the e-stop was pressed [s]."""
+        """Begin to hold.
+
+        Args:
+            position: Position to send [D], or None.
+            rest: Stopping distance [D].
+            captured: Capture time of the newest joints when the e-stop was pressed [s].
+        """
         self.position = position
         self.rest = rest
         self.captured = captured

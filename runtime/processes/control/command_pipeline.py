@@ -343,7 +343,9 @@ class CommandPipeline:
     def _check_joints_returned(
         self, run: ExecuteChunks, step: int, planned: float, observation: LatestObservation
     ) -> None:
-        """Discard the plan if joints are measured again after a gap in which it moved on without the robot."""
+        """Discard the plan if joints are measured again after a gap, and the plan has moved on without the robot
+        meanwhile.
+        """
         state = self.actuator.state(observation, planned, None)
         if (
             not self._safety.unseen(state)
@@ -358,9 +360,9 @@ class CommandPipeline:
         return not often and planned - self._unseen_since < self._settings.safety.joint_gap_s
 
     def _elsewhere(self, state: RobotState, missing: float) -> str:
-        """Return a message if a joint returned away from its commanded position, "" if none did.
+        """Return a message if a joint is away from its commanded position after a gap in the measurements.
 
-        `missing` is for how long the joints were missing [s].
+        The result is "" if no joint is. `missing` is the duration of the gap [s].
         """
         limits, allowed = self._settings.limits, self._settings.safety.steady_error
         apart = np.where(limits.position_mask, np.abs(state.measured - state.previous), 0.0)

@@ -1,4 +1,7 @@
-"""Alarms on which control holds without an order: missing heartbeats, and a robot that was displaced."""
+"""Alarms on which control holds by itself, without an order of the coordinator.
+
+The alarms are missing heartbeats of processes, and a robot that was displaced.
+"""
 
 from __future__ import annotations
 

@@ -63,7 +63,11 @@ class Led:
 
     @property
     def verdict(self) -> np.ndarray:
-        """Number of parts in which each joint moved with the command, minus the number in which it did not, int [D]."""
+        """Evidence for each joint that its readings follow the command, int [D].
+
+        It is the number of parts of the convergence in which the readings moved with the command, minus the number of
+        parts in which they did not.
+        """
         return np.asarray(self.along - self._alone)
 
     @property

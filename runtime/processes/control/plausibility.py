@@ -173,8 +173,8 @@ class JointPlausibility:
     def median_joints(self, joints: Float64) -> Float64:
         """Return the median of the newest three trusted samples for each joint, which removes a spike.
 
-        Wrapping angles are in the turn of `joints` [D]. After a gap, `joints` are returned until there are three
-        samples: the earlier ones are from before the gap.
+        An angle that wraps is returned in the same turn as its value in `joints` [D]. After a gap in the measurements,
+        `joints` are returned until there are three new samples, because the earlier samples are from before the gap.
         """
         newest = [] if self._chain is None else list(islice(reversed(self._chain.samples), _CONSISTENT))
         gaps = [after.captured - before.captured for after, before in pairwise(newest)]
@@ -306,7 +306,11 @@ class JointPlausibility:
         return ""
 
     def _swapped_joints(self, before: _Sample, after: _Sample) -> str:
-        """Return the joints that have exchanged their values, within the motion possible meanwhile."""
+        """Return the names of joints that have exchanged their values between two samples, "" if there are none.
+
+        The values need not be exactly equal: they may differ by the distance that the joints can move between the
+        samples.
+        """
         away = np.abs(difference(after.joints, before.joints, self._wrapping))
         moved_joints = np.flatnonzero(self._places & (away > _SAME))
         apart = np.sort(before.joints[moved_joints]) - np.sort(after.joints[moved_joints])
@@ -449,7 +453,10 @@ class _LastDigitActivity:
 
 
 class _FrozenJointDetector:
-    """Detector of a joint with a constant number, under fresh stamps, while its command moves."""
+    """Detector of a joint whose reading stays at the same number while its command moves.
+
+    The stamps of the readings advance meanwhile, so that the readings look fresh.
+    """
 
     def __init__(self, limits: Limits) -> None:
         dim = len(limits.names)

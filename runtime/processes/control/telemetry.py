@@ -134,7 +134,7 @@ class Telemetry:
         self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
     def add_merge(self, merged: MergeResult) -> None:
-        """Queue the placement of a chunk for the end of the tick."""
+        """Queue the report on the steps at which the rows of a chunk were placed; it is sent at the end of the tick."""
         self._outbox.append(merged)
 
     def add_tick(self, seen: LatestObservation, sent: TickResult, simulated: bool) -> None:

@@ -469,7 +469,7 @@ class Tick:
         self._robot.hold_here()
 
     def _report_untrusted_joints(self) -> None:
-        """Emit once which joints are distrusted; hold if the robot is moving."""
+        """Emit an event, once, if joints have become distrusted; hold if the robot is moving."""
         doubt = self._displacement.pop_untrusted_reason()
         if doubt and self._robot.behaviour.moving:
             self._robot.hold_because("implausible", doubt)

@@ -31,7 +31,7 @@ from runtime.station.spec import StationSpec
 
 @dataclass(eq=False)
 class Components(ABC):
-    """Components of a coordinator, and its methods for events."""
+    """Components of a coordinator, and the methods by which they emit, publish and handle events."""
 
     boot: str
     shared: SharedState

@@ -22,7 +22,8 @@ HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser's integers are inexa
 class LeaseState:
     """Lease: holder, epoch, expiry on our monotonic clock; `by` is the holder's display name.
 
-    `hidden`: since the last renewal the holder's page has reported that it is hidden.
+    `hidden` is True if the holder's page has reported that it is hidden, and the lease was not renewed after that
+    report.
     """
 
     holder: str
@@ -55,7 +56,10 @@ class Lease:
         return {"holder": lease.holder, "by": lease.by, "epoch": lease.epoch, "expires_in": lease.until - now}
 
     def lost(self, now: float) -> bool:
-        """Return True if the newest lease expired unintentionally: neither released nor with a hidden page."""
+        """Return True if the newest lease has expired unintentionally.
+
+        An expiry is intended if the holder has released the lease, or if the holder's page is hidden.
+        """
         return self._held is not None and now >= self._held.until and not self._held.hidden
 
     @property

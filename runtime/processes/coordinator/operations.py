@@ -229,10 +229,11 @@ class SessionActions:
         return {"episode": episode}
 
     def _mode(self, request: RunRequest) -> Mode:
-        """Return the mode of a run.
+        """Return the mode in which the requested run is to be executed.
 
         Raises:
-            RuntimeFault: the station is not set up for it.
+            RuntimeFault: the station is not set up for the requested mode, or the request has arguments that need
+                another mode.
         """
         collects, settings = self.spec.collecting, self.spec.deployment
         mode = request.mode or ("collect" if collects else settings.run.mode)
@@ -332,7 +333,8 @@ class SessionActions:
     def discard(self, asked: DiscardRequest) -> TransitionResult:
         """Mark an episode as discarded.
 
-        If the request names none, it is the open episode, which ends as by `end_run`, or the newest one.
+        If the request names no episode, the open episode is marked, and its run is ended with `end_run`. If no episode
+        is open either, the newest one is marked.
         """
         result = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:

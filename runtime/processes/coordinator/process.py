@@ -246,9 +246,9 @@ class CommandService:
         """Return the joints of the newest control step, float32 [D] for each stage from plan to measurement.
 
         `raw` is the newest chunk's action for the step, `planned` the action of all chunks before safety, `simulated`
-        the command of the simulated robot; `raw` and `planned` are NaN if there is none. `chunk` has the largest weight
-        in the step (-1: none), `chunks` is the number of contributing chunks, `limited` whether safety has changed the
-        action.
+        the command of the simulated robot; `raw` and `planned` are NaN if there is none. `chunk` is the number of the
+        chunk that has the largest weight in the step, -1 if there is no chunk. `chunks` is the number of contributing
+        chunks, and `limited` is whether safety has changed the action.
         """
         status, observation = (
             self._coordinator.shared.control.read(),

@@ -163,7 +163,12 @@ class Runs:
         return identity if manifest else ""
 
     def on_episode_opened(self, message: EpisodeOpened, running: bool) -> str:
-        """Begin the run if its episode was opened; return why it cannot begin, "" if it can."""
+        """Begin the run after its episode was opened, or after opening failed and the run need not be recorded.
+
+        The robot is started only if the session is `running`. If the run cannot begin, the method returns the reason:
+        an error of the recorder, or a doubt about the joints that arose after the run was accepted. Otherwise it
+        returns "".
+        """
         if message.error and message.run == 0:
             self._alone = ""
         run = self.open
@@ -267,7 +272,10 @@ class Runs:
     # --- motions within a run --------------------------------------------------------------------------------
 
     def move(self, goal: Float64, speed: float) -> None:
-        """Move to `goal` [D] on a limited path, within the open run if there is one."""
+        """Order control to move the robot to `goal` [D] on a limited path, a generated motion.
+
+        The motion belongs to the open run, if there is one. `speed` is the share of the speed of generated motions.
+        """
         self._orders.send_order("motion", run=self._begun, goal=goal, speed=speed)
 
     def cancel(self) -> None:

@@ -146,7 +146,7 @@ class Lockstep:
         )
 
     def until(self, reached: Callable[[], bool], seconds: float, what: str) -> SessionState:
-        """Tick until `reached()` returns True; return the session's state then.
+        """Execute ticks until `reached()` returns True; return the state that the session has after the last tick.
 
         Raises SetupError, which names `what`, after `seconds` [s] of virtual time.
         """

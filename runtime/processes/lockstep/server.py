@@ -79,7 +79,8 @@ class _TickingClock(Clock):
 class ServedLockstep(Lockstep):
     """Lockstep station with sockets; call `serve`, then `close`.
 
-    Raises SetupError if another process has the station, or if it needs something that lockstep lacks.
+    Raises SetupError if another process has locked the station, or if the deployment needs something that lockstep
+    lacks.
     """
 
     def __init__(
@@ -165,7 +166,12 @@ class ServedLockstep(Lockstep):
         """Do nothing: time advances at the start of a tick, since the policy is queried between ticks."""
 
     def _is_paused(self) -> bool:
-        """Return True if time is paused: it is not needed, or the policy or a closing episode is awaited."""
+        """Return True if virtual time is paused.
+
+        Time is paused while the station waits for the policy or for the end of a closing episode. It is also paused
+        while nothing needs time: the session is idle or ready, no generated motion or recording is in progress, and
+        control has no orders to read. A station that is paced by real time is not paused for this second reason.
+        """
         if self._asking.start_waiting() or self.media.closing:
             return True
         if self._paced or self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):

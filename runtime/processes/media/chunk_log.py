@@ -33,7 +33,7 @@ class ChunkLog:
             self._write(self._answers.pop(next(iter(self._answers))), None)
 
     def add_merge(self, merged: MergeResult) -> None:
-        """Add the placement of a chunk by control."""
+        """Add control's report on the steps at which it has placed the rows of a chunk."""
         answer = self._answers.pop(merged.chunk_id, None)
         if answer is not None:
             self._write(answer, merged)

@@ -172,10 +172,10 @@ class Media:
                 return  # later messages belong to an episode that has not begun
 
     def _ready_to_begin(self) -> bool:
-        """Begin the requested episode that waits until the previous episode is closed, if there is one.
+        """Begin the requested episode if one is waiting and may begin; return False if it must continue to wait.
 
-        It begins when the previous episode is closed, or when closing takes too long. Return False if it must continue
-        to wait, else True.
+        A requested episode waits until the previous episode is closed, or until closing has taken too long. Return True
+        if no episode is waiting any more.
         """
         waiting = self._waiting
         if waiting is None:

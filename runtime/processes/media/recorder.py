@@ -241,7 +241,10 @@ class Recorder:
         return replace(tick, executed=self._applied, source="none" if reported is None else "teleop")
 
     def _target(self, row: int) -> int:
-        """Return the control step at which row `row` is due; the last tick not later than this step becomes the row."""
+        """Return the control step at which row `row` is due.
+
+        The row is recorded from the last tick whose step is not later than this step.
+        """
         assert self._first_step is not None
         # The tolerance prevents that rounding moves a row which falls exactly on a tick to the previous tick.
         return self._first_step + math.floor(row * self._grid.control_rate / self._grid.fps + 1e-9)

@@ -101,7 +101,10 @@ class Reception:
             self.report()
 
     def poll_commands(self) -> bool:
-        """Start or end the source's run as media requests; return True if a run has begun."""
+        """Read the requests of media, and start or end the run of the source accordingly.
+
+        Return True if a run of the source has begun and media was informed of it.
+        """
         for payload in self._shared_state.rings["source"].drain():
             message = decode(payload)
             if isinstance(message, BeginRun):

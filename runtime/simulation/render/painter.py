@@ -163,7 +163,7 @@ def _in_view(camera: PinholeCamera, inside: Float32, solids: Solids) -> NDArray[
 
 
 def _pixels(camera: PinholeCamera, inside: Float32) -> Float32:
-    """Return the pixels [n, 2], columns and rows, of points in camera axes."""
+    """Project the points `inside` [n, 3], given in camera axes, and return their pixels [n, 2] as columns and rows."""
     depth = np.maximum(inside[:, 2:], _NEAR)
     pixels = inside[:, :2] / depth * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return np.asarray(np.clip(pixels, -_FAR_OUT, _FAR_OUT), np.float32)

@@ -102,9 +102,10 @@ class CompressedImage(IdlStruct, typename="sensor_msgs::msg::dds_::CompressedIma
 
 
 def _fields(packed: bytes, kinds: str, *numbers: int) -> bytes:
-    """Return `packed`, followed by padding to a multiple of four bytes and by the numbers, four bytes each.
+    """Return `packed`, followed by padding to a multiple of four bytes and by `numbers`, four bytes each.
 
-    `kinds` are their format characters for `struct`. `packed` is without the header of four bytes.
+    `kinds` has the format character of each number for `struct`. `packed` is the message without its header of four
+    bytes.
     """
     return packed + bytes(-len(packed) % 4) + struct.pack(f"<{kinds}", *numbers)
 

@@ -2,8 +2,9 @@
 
 It acts as a policy that has learnt the task. It detects the block's place in the overhead image of the request, and
 estimates its velocity from earlier requests. It extrapolates this motion over the chunk, but not beyond the ends of the
-belt. Its rows are ahead of time by the robots' lag. It approaches from the joints of the request within a speed limit.
-It cannot predict when the belt reverses.
+belt. Each row is the place at which the block will be a little later than at the row's step, to compensate for the
+robots' lag. The policy approaches from the joints of the request within a speed limit. It cannot predict when the belt
+reverses.
 """
 
 from __future__ import annotations

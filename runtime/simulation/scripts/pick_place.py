@@ -1,10 +1,10 @@
 """Scripted policy that picks up the block and puts it on the plate, using only its observations.
 
-It detects block and plate in the overhead image of the request, and finds its progress from the joints in it. Between
-the requests of one connection it remembers its route, its row in the route and the time. A route consists of legs. A
-leg that moves the arm ends when the joints have arrived, a leg that opens or closes the jaws when the measured jaws
-have moved. The row advances with the time between requests, so that a chunk continues the previous chunk whatever the
-delay.
+The policy detects block and plate in the overhead image of the request. It finds out from the joints in the request how
+far it has come. Between the requests of one connection it remembers its route, its row in the route and the time. A
+route consists of legs. A leg that moves the arm ends when the joints have arrived, a leg that opens or closes the jaws
+when the measured jaws have moved. The row advances with the time between requests, so that a chunk continues the
+previous chunk whatever the delay.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ class PickPlaceEpisode:
         return self._route
 
     def _distances(self, q: Float64) -> Float64:
-        """Return the distances [rad] of joints [D] from the rows of the present leg."""
+        """Return the distance [rad] of the joints `q` [D] from each row of the present leg of the route."""
         return self._apart(self._on().legs[self._leg].rows, q)
 
     def _apart(self, rows: Float64, q: Float64) -> Float64:

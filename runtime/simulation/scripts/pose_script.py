@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 
 class PoseScript(Script):
-    """Script that answers the requests of another script, with the joint rows of its answers converted to poses.
+    """Script that answers requests as another script does, but in poses.
 
-    The metadata declare the format of the rows; `rate` [Hz] is the rate of the rows.
+    The joint rows in the answers of the other script are converted to poses. The metadata declare the format of the
+    rows; `rate` [Hz] is the rate of the rows.
 
     Raises:
         SetupError: If the format does not fit the robot.

@@ -97,9 +97,11 @@ class Postures:
     ) -> tuple[Float64 | None, Float64 | None]:
         """Return joints [stations, D] on the vertical path down to the block, and on the path down to the plate.
 
-        Each is None if it is not reached. The jaws grasp the pair of sides that needs the smaller rotation; if that is
-        not reached, the other pair. `short` [m] is the deliberate error of the block's place, towards the arm; `tilts`
-        [rad] are outwards from straight down, at the bottom and at the top.
+        Each path is a row of stations, poses of the fingertips from the top to the bottom. A result is None if the arm
+        does not reach that path. The jaws grasp the pair of sides that needs the smaller rotation; if that is not
+        reached, the other pair. `short` [m] is a deliberate error: the arm reaches for a place that is so much nearer
+        to its shoulder than the block. `tilts` are the angles [rad] of the fingers outwards from straight down, at the
+        bottom and at the top.
         """
         base = self._shoulders[arm.name]
         reach = math.dist(base, block[:2])
@@ -149,10 +151,11 @@ class Postures:
     def _down(
         self, arm: Group, q: Float64, place: Place, twist: float, heights: tuple[float, float], tilts: Tilts
     ) -> Float64 | None:
-        """Return joints [stations, D] of an arm with open jaws on a vertical path to `place`; None if it cannot reach
-        it.
+        """Return joints [stations, D] of an arm with open jaws on a vertical path to `place`.
 
-        All other joints are those of q [D].
+        The result is None if the arm cannot reach a station of the path. All other joints are those of `q` [D]. `twist`
+        is the rotation of the jaws from across the arm [rad]. `heights` [m] and `tilts` [rad] are those of the
+        fingertips at the bottom and at the top of the path.
         """
         bearing = self._bearing(arm, place)
         yaw = bearing + self._nominal[arm.name].across + twist

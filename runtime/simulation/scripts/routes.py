@@ -125,7 +125,11 @@ class RoutePlanner:
     def _routes(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
     ) -> Iterator[Route]:
-        """Yield routes of all arms, the nearest first; then routes before which the other arms move to rest."""
+        """Yield the possible routes for the block, the preferred ones first.
+
+        First come the routes of all arms from the joints `q`, those of the arm nearest to the block before those of the
+        others. After them come routes that begin by moving the other arms to rest, in the same order of the arms.
+        """
         nearest = sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block))
         for makes_way in (False, True):
             for arm in nearest:

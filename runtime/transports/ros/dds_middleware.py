@@ -205,7 +205,11 @@ class DdsMiddleware(Middleware):
             _domains.leave(self._domain)
 
     def _create_endpoint(self, kind: Any, topic: Topic, life: bool) -> Any:
-        """Create a reader or writer (`kind`) of the topic."""
+        """Create a reader or a writer of the topic; `kind` is the class of the endpoint.
+
+        If `life` is True, messages that are older than the lifetime of commands are not delivered. Raises
+        TransportError if the topic cannot be opened.
+        """
         from cyclonedds.core import DDSException
         from cyclonedds.topic import Topic as DdsTopic
 

@@ -50,7 +50,10 @@ class Writer(fields.Writer):
         self._counted(text.encode("utf-8"))
 
     def header(self, stamp: int, frame: str) -> None:
-        """Write a header: a count of 0, which the publisher replaces by its own, the stamp and the frame."""
+        """Write a header, which consists of a count, the stamp [ns] and the frame.
+
+        The count is written as 0, because the publisher replaces it by its own count.
+        """
         self._out += struct.pack("<III", 0, *divmod(stamp, SECOND))
         self.string(frame)
 

@@ -125,7 +125,11 @@ class TcpRosMiddleware(Middleware):
             child = self._start_child(_PAUSES_S[0])
 
     def _start_child(self, pause: float) -> RospyProcess | None:
-        """Return a child that opens all topics, after `pause` [s] and as many attempts as needed; None when closing."""
+        """Start a child that opens all topics, and return it; None if the middleware is being closed.
+
+        The first attempt is made after `pause` [s]. Attempts are repeated, with pauses between them, until one
+        succeeds.
+        """
         later = iter(_PAUSES_S)
         while not self._ending.wait(pause):
             pause = next(later, _PAUSES_S[-1])

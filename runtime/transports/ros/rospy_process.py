@@ -124,7 +124,11 @@ class RospyProcess:
     def read_messages(
         self, message: Callable[[int, bytes], None], word: Callable[[dict[str, Any]], None]
     ) -> None:
-        """Call `message` or `word` for each message of the child, until it ends or `interrupt` is called."""
+        """Read what the child sends, until the child ends or `interrupt` is called.
+
+        `message` is called with the index of the topic and the bytes of each ROS message. `word` is called with the
+        fields of each report of the child about itself.
+        """
         with contextlib.suppress(EOFError, OSError):
             while True:
                 kind, index, payload = self._next()

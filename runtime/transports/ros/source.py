@@ -308,7 +308,10 @@ class RosSource(Source):
         return {self._reason(name) for name in names}
 
     def _reason(self, name: str) -> str:
-        """Return the key under which a stream's silence is reported once; it includes the fault of refused messages."""
+        """Return a text that identifies the reason for a stream's silence; each reason is reported once.
+
+        The text consists of the stream's name and the fault for which its messages are refused, if they are refused.
+        """
         return f"{name}: {self._refusals.get(name, ('', ''))[0]}"
 
     def _silence(self, name: str, age: float, match: Match) -> str:

@@ -53,7 +53,8 @@ class Topics(Settings):
 class StreamSpec:
     """One stream of a frame: its kind, its group or camera key, and its topic.
 
-    `joints` are the names in the message of the values to read, in the group's order.
+    A message of joints may contain more joints than the stream needs. `joints` names the joints whose values are read,
+    by their names in the message, in the order of the group.
     """
 
     kind: Literal["joints", "gripper", "eef", "camera"]

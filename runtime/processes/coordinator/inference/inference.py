@@ -203,11 +203,14 @@ class Inference:
         self._commitment.clear()
 
     def step(self) -> None:
-        """Request one chunk, in a mode on demand."""
+        """Request one chunk; for the modes "step" and "preview", in which a person requests each chunk."""
         self._wanted = True
 
     def commit(self) -> None:
-        """Send the proposal to control; no row is stale, because the robot was at rest during the review."""
+        """Send the chunk that a person has reviewed, the `proposal`, to control; do nothing if there is none.
+
+        No row of the chunk is stale, because the robot was at rest during the review.
+        """
         if self.proposal is not None:
             proposal, self.proposal = self.proposal, None
             self._post(proposal)

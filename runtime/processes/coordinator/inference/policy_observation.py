@@ -46,7 +46,7 @@ class ObservationProvider(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StalenessLimits:
-    """Bounds on observations: ages in seconds, the control rate in Hz."""
+    """Greatest permitted ages of joints and pictures in an observation [s], with the control rate [Hz]."""
 
     control_rate: float
     joint_age: float

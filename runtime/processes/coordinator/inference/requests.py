@@ -61,7 +61,7 @@ class MissBound:
     jump: float
 
     def misses(self, solved: IkResult) -> NDArray[np.bool_]:
-        """Return which poses have a larger position or rotation error, bool [T, arms]."""
+        """Return the poses whose position or rotation error exceeds its bound, as bool [T, arms]."""
         over: NDArray[np.bool_] = (solved.position_error > self.position) | (
             solved.rotation_error > self.rotation
         )
@@ -153,8 +153,8 @@ class PolicyRequests:
     def end_episode(self) -> None:
         """End the rollout on the policy's server, without waiting.
 
-        A failure is logged. In that case the policy ends the rollout before its next request, or fails then with the
-        reason.
+        A failure is only logged. The policy then ends the rollout before its next request; if that fails too, the
+        request fails with the reason.
         """
         policy, self._fresh = self.policy, True
 

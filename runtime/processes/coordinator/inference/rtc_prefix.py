@@ -158,20 +158,23 @@ class RtcPrefix:
     ) -> Conditioning | None:
         """Return the conditioning of a request about `observation_step`; None if there is nothing to continue.
 
-        That is so if no chunk is merged, none of its rows is left, the plan is unknown, or the model's rows are
-        relative.
+        There is nothing to continue if no chunk is merged, no row of the newest merged chunk is left, the plan is
+        unknown, or the model's own rows are relative.
 
-        If the response is expected after the last planned step, `warning` is set, and only planned rows count as
-        consumed until the response arrives. It is also set if the model's rows are relative. A chunk with a rate of its
-        own has no row exactly at the observation: its remaining rows are resampled.
+        `warning` is set in two cases. In the first, the response is expected after the last planned step; only planned
+        rows then count as consumed until the response arrives. In the second, the model's own rows are relative, so
+        that the result is None.
+
+        A chunk with a rate of its own has no row exactly at the observation: its remaining rows are resampled.
 
         Args:
             observation_step: control step of the new observation.
             delays: recent measured delays [control steps]; if empty, the delay of the newest chunk is used.
-            quantile: quantile of `delays` that is predicted, in rows, rounded up.
-            execution_horizon: number of steps [control steps] of the response that will be executed; None: the whole
-                chunk. The present plan does not depend on it.
-            observation: reference of rows that are not absolute, as for the response; required for such rows.
+            quantile: the delay that is predicted is this quantile of `delays`, in rows, rounded up.
+            execution_horizon: number of steps [control steps] of the response that will be executed; None: the
+                whole chunk. The present plan does not depend on it.
+            observation: new observation. Rows that are not absolute are converted to be relative to it, as those of
+                the response will be. It is required for such rows.
         """
         self.warning, self.predicted_delay = "", 0
         if not self._merged:

@@ -112,9 +112,10 @@ class ThreadRunner(Runner):
 class DeclaredRunner(Runner):
     """Runner that executes calls between two ticks; a call's result is ready after a declared number of ticks.
 
-    The function `declared` converts what a call returned to its result and this number. Calls start at `start_waiting`.
-    They run on a thread, so that the ticking thread can answer commands meanwhile; no tick may pass while a call is
-    running. Therefore the step at which a result is ready does not depend on the call's real duration.
+    The function `declared` receives what a call returned. It returns the result of the call, and the number of ticks
+    after which that result is ready. Calls start at `start_waiting`. They run on a thread, so that the ticking thread
+    can answer commands meanwhile; no tick may pass while a call is running. Therefore the step at which a result is
+    ready does not depend on the call's real duration.
     """
 
     def __init__(self, declared: Callable[[Any], tuple[Any, int]]) -> None:

@@ -32,7 +32,10 @@ class GripperPlan:
 
 
 class Grippers:
-    """Present locks of grippers, and planning of requests."""
+    """Grippers of a station, with their present `locks` [D].
+
+    It also plans the requests to open, close, lock or unlock grippers.
+    """
 
     def __init__(self, spec: StationSpec) -> None:
         self._groups = [group for group in spec.robot.groups if group.gripper is not None]

@@ -43,7 +43,8 @@ _TOLERANCE = 1e-6
 class TargetPreview:
     """Target float64 [D] within limits, its poses float32 [8 * arms], and its deviations from the request.
 
-    `clipped` names joints that were clipped to a limit. The errors are those of a jog's pose, 0 without a jog.
+    `clipped` names joints that were clipped to a limit. If the request was a jog, `position_error` and `rotation_error`
+    are the errors of the pose that was reached; otherwise both are 0.
     """
 
     joints: Float64

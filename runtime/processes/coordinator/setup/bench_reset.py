@@ -61,7 +61,7 @@ class BenchReset:
         return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
 
     def start(self, reset: dict[str, Any]) -> None:
-        """Request this reset from now on."""
+        """Begin to request `reset`, the result of `from_request`; `is_done` sends and repeats the request."""
         self._reset = reset
         self._refused = ""
         self._since = self._clock.now()

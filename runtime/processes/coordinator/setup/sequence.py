@@ -213,7 +213,9 @@ class SetUp:
         self._begin_motion_only(self._plan.robot.poses[pose], where, Stage.HOME)
 
     def begin_approach(self, first_action: Float64) -> None:
-        """Begin a motion to the policy's first action [D], which must be allowed, without the other stages.
+        """Begin a motion to the policy's first action [D], without the other stages of a set-up.
+
+        The caller must have checked that this position is allowed.
 
         Raises:
             RuntimeFault: the path is not free.
@@ -454,9 +456,10 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
 
 
 def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:
-    """Return the distance of an action [D] from `joints` [D]: {"distance" rad, "joint", "far"}.
+    """Return the distance of the action `action` [D] from `joints` [D], as a dict.
 
-    Only joint positions count, neither grippers nor speeds.
+    "distance" is the distance [rad] of the joint that is farthest away, "joint" is the name of this joint, and "far" is
+    True if the distance exceeds `safety.first_action_far`. Only joint positions count, neither grippers nor speeds.
     """
     limits = spec.limits
     away = np.where(limits.position_mask, np.abs(difference(action, joints, spec.dims.wrapping)), 0.0)
