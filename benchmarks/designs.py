@@ -203,10 +203,10 @@ def powers(rows: Courses) -> Iterator[Figure]:
 
 
 def estimates(rows: Courses) -> Iterator[Figure]:
-    """Yield the bias of the difference, raw and corrected for early stopping, and the coverage of the corrected
-    interval.
+    """Yield the bias of the estimated difference, and the coverage of the corrected interval.
 
-    Bias and coverage are computed exactly, over every table at which the design ends.
+    The bias is given for the raw estimate and for the estimate that is corrected for early stopping. Bias and coverage
+    are exact: they are sums over every table of results at which the design can end.
     """
     for name in ("late", "early"):
         exact = boundary_of(DESIGNS[name], SIZES[0])

@@ -75,7 +75,10 @@ def figures(
     kills: Mapping[str, Any],
     listing: Mapping[str, Any],
 ) -> list[Figure]:
-    """Return the figures of the five parts, with and without requirements."""
+    """Return the figures of the five parts of the benchmark.
+
+    Some figures have a requirement, others are only reported.
+    """
     memory, disk = station["memory_mb"], station["to_disk_ms"]
     rows: Sequence[Mapping[str, Any]] = kills["rows"]
     return [

@@ -151,8 +151,8 @@ class CommandPipeline:
     def move(self, goal: Float64, speed: float) -> None:
         """Brake, then move to `goal` [D] at `speed`, a share of the speed of generated motions.
 
-        Dimensions that are NaN stay where they stop, and speeds end at 0. Binary grippers end open or closed, and
-        switch at the beginning.
+        A dimension for which `goal` is NaN stays where braking has stopped it. Dimensions that are speeds end at 0.
+        Binary grippers end open or closed, and switch at the beginning of the motion.
         """
         self._begin()
         self._start_motion(snap_grippers(self._settings.switches, goal, self.actuator.commanded), speed)

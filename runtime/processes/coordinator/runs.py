@@ -277,7 +277,7 @@ class Runs:
             self._start_after_arrival(self.open)
 
     def approach(self, goal: Float64) -> None:
-        """Move to `goal` [D], the start of the proposal."""
+        """Move the robot to `goal` [D], the joints at which the proposed chunk starts."""
         if self.open is not None:
             self.open.approach()
             self.move(goal, 1.0)

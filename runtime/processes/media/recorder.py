@@ -189,7 +189,10 @@ class Recorder:
     # --- input ---------------------------------------------------------------------------------------------
 
     def add_observation(self, observation: Observation) -> None:
-        """Add an observation from reception, before the record of a tick that used it."""
+        """Add an observation from reception.
+
+        The caller must add it before the record of a tick that used the observation.
+        """
         self._seen.append(observation)
 
     def add_event(self, event: Mapping[str, Any]) -> None:

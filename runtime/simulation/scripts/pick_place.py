@@ -197,9 +197,10 @@ class PickPlaceEpisode:
         self._follow_route(None)
 
     def _is_over(self, pause: float) -> bool:
-        """Return True if the episode ended before a pause in the requests of `pause` [s].
+        """Return True if the episode ended before a pause of `pause` [s] in the requests.
 
-        That is so if the pause is long, and before it there was no route or the arm was already leaving the plate.
+        The episode has ended if the pause is long and one of two conditions held before the pause: there was no route,
+        or the arm was already leaving the plate.
         """
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED

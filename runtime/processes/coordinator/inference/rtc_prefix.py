@@ -310,9 +310,10 @@ class RtcPrefix:
         contributions: Sequence[Shares],
         table: Callable[[_CommittedChunk], tuple[Numbers, float]],
     ) -> MixtureParts:
-        """Return the components from which the rows for these steps are mixed, by the weights `contributions`.
+        """Return the components from which the rows for `steps` are mixed.
 
-        `table` returns for a chunk the rows to use, and their number per control step.
+        `contributions` has the weights of the chunks at each of these steps. `table` returns two values for a chunk:
+        the rows to use, and the number of these rows per control step.
         """
         numbers: list[Numbers] = []
         weights: list[Float64] = []
