@@ -153,7 +153,10 @@ class PartStore:
         self._done: dict[str, dict[str, Any]] = {part["name"]: part for part in map(json.loads, lines)}
 
     def once(self, name: str, part: Part, rows: Courses) -> list[Figure]:
-        """Return the figures of a part and add its rows to `rows`; they are computed only if they are not stored."""
+        """Return the figures of a part, and add its rows to `rows`.
+
+        The figures and rows are computed only if they are not stored yet.
+        """
         if name not in self._done:
             own: Courses = []
             figures = [asdict(figure) for figure in part(own)]
@@ -242,9 +245,9 @@ def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, 
 
 
 def drifts(rows: Courses) -> Iterator[Figure]:
-    """Yield the largest error found for common rates that change over time; it is only reported.
+    """Yield the largest error that was found for rates that change over time, the same rate for both checkpoints.
 
-    The designs assume constant rates; `type1` is their error for those.
+    It is only reported. The designs assume constant rates; `type1` is the error of the designs under this assumption.
     """
     for name, (case, n) in DRIFTING.items():
         exact = boundary_of(case, n)

@@ -137,7 +137,10 @@ def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
 
 
 class Scheduling:
-    """Kernel scheduling of one process of a lab since creation of this object."""
+    """Statistics of how the kernel has scheduled one process of a lab since this object was created.
+
+    `module` is the module that the process runs.
+    """
 
     def __init__(self, lab: psutil.Process, module: str) -> None:
         (self._process,) = (p for p in lab.children(recursive=True) if named(p.cmdline()) == module)

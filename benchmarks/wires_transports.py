@@ -170,7 +170,15 @@ def number_marks(picture: UInt8) -> UInt8:
 
 
 def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
-    """Return for each tick the age of the oldest image [s]; None if an image was being overwritten."""
+    """Return for each tick the age of the oldest image [s].
+
+    The age is None if the start time of any image is unknown, because this image was being overwritten.
+
+    Args:
+        looks: For each tick, what the control loop read from each camera.
+        born: How the start time of an image is found: "due", "strip" or another word, see `_birth`.
+        sent: Start times recorded by the sender.
+    """
     ages: list[float | None] = []
     for reading in looks:
         births = [_birth(index, *entry, born, sent) for index, entry in enumerate(reading)]
@@ -189,7 +197,12 @@ def sent_hz(sent: Any, begun: float, took: float) -> float | None:
 def _birth(
     camera: int, marks: UInt8 | None, captured: float, now: float, born: str, sent: Any
 ) -> float | None:
-    """Return when the sender began an image [s]; None if its marks could not be read."""
+    """Return when the sender began an image [s]; None if the marks of the image could not be read.
+
+    `born` names how this time is found. "due": the image has no sender and began when it was due, at `captured`.
+    "strip": the number in the strip of the image is an index of `sent`. Otherwise the time comes from the bar of the
+    image and the start times `sent` of the camera.
+    """
     if born == "due":
         return captured
     if marks is None:

@@ -85,7 +85,8 @@ class PostureSearch:
     def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
         """Return the posture with as many joints as possible moved back to their home values.
 
-        One joint after the other is moved, and stays there if not more than `fewest` links touch then.
+        The joints are tried one after the other. A joint keeps its home value if at most `fewest` links touch each
+        other with it.
         """
         for dim in self._dims():
             tried = q.copy()

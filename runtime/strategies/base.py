@@ -205,8 +205,8 @@ def _fade(
 ) -> None:
     """Start a fade in which the next plan takes over from `rows` within `count` steps.
 
-    If there are fewer rows than steps, the last row is held. `makers` are the contributions of the first rows; further
-    rows are held targets.
+    If there are fewer rows than steps, the last row is held. `makers` are the contributions of the first rows. Rows
+    beyond them are held targets, and their contribution is HELD.
     """
     last = np.minimum(np.arange(count), len(rows) - 1)
     contributions = [*makers[:count], *single_contribution(HELD, max(0, count - len(makers)))]

@@ -353,7 +353,11 @@ class CommandPipeline:
             self._go_on(run, planned - self._unseen_since)
 
     def _may_wait(self, planned: float) -> bool:
-        """Return True if a run may wait for its joints: their gap is short, and gaps are not too frequent."""
+        """Return True if the run may wait for joints that are missing.
+
+        This is the case while the present gap in the joints is short, and gaps have not been too frequent. `planned` is
+        the planned time of the tick [s].
+        """
         often = len(self._gaps) == _GAPS and planned - self._gaps[0] < _GAPS_S
         return not often and planned - self._unseen_since < self._settings.safety.joint_gap_s
 

@@ -60,9 +60,11 @@ class Skill:
     """Deliberate imperfection of the policy.
 
     `noise` [m] is the standard deviation of the error of the block's place in x and in y, drawn for each attempt. The
-    yaw has an error as well: with noise of one block edge its standard deviation is one radian. `failure_rate` is the
-    probability that in an episode the policy drops the block on the way or always grasps short of it; `seed` decides
-    both, episode by episode.
+    yaw has an error as well, whose standard deviation grows with `noise`: it is one radian if `noise` is the edge of a
+    block.
+
+    `failure_rate` is the probability that an episode fails. In an episode that fails, the policy either drops the block
+    on the way or always grasps short of it. `seed` decides the errors and the failures, episode by episode.
     """
 
     noise: float = 0.0

@@ -203,11 +203,11 @@ class RtcPrefix:
     def _planned(
         self, committed: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
-        """Return the rows of `committed`, with the planned rows in place of its own at `steps`.
+        """Return the rows of the chunk `committed`, where the rows at `steps` are replaced by the rows of the plan.
 
-        None if the plan is unknown. `passed` is the row nearest to the first step. Rows that are not absolute cannot be
-        mixed themselves. Instead, their joints are mixed, and the result is converted to rows relative to
-        `observation`.
+        Return None if the plan is unknown. `passed` is the row of the chunk nearest to the first step. Rows that are
+        not absolute cannot be mixed with each other. In this case joints are mixed, and the result is converted to rows
+        relative to `observation`.
         """
         contributions = [self._contributions_at(at) for at in steps.tolist()]
         if committed.chunk.mode != "absolute":
