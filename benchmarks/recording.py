@@ -191,7 +191,10 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
 
 
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
-    """Kill each process at 10 moments, 50 if `long`; on a slow machine at fewer, but at least 10 in all."""
+    """Kill the recording processes 30 times in turn, and the worker 10 times; 150 and 50 times if `long`.
+
+    On a slow machine there are fewer kills, but together at least 10 of them. If `long`, all are made.
+    """
     recording, working = (
         (KillCount(150, 150, 0.0), KillCount(50, 50, 0.0))
         if long

@@ -3,10 +3,12 @@
 Sender, receiving side (`benchmarks.wires_receiver`, like reception) and control loop are separate processes. The
 control loop is this process: it polls shared state at 100 Hz, so that its readings are uniformly distributed between
 two images. Live images of 640x480 arrive at 30 Hz. Their age is the time since the sender began to draw and encode
-them, which is known by their number; the age of images of recordings, which have no sender, is the time since they were
-due. Afterwards another receiving side receives the images of ten idle minutes as fast as possible, and its memory
-growth since the first of them is reported. If this takes more than a few times as long as the live part, it ends early,
-and the number of minutes is reported.
+them; the number in the image shows when that was. Images of recordings have no sender: their age is the time since they
+were due.
+
+Afterwards another receiving side receives, as fast as possible, as many images as arrive in ten minutes of idling. The
+growth of its memory is reported, counted from the end of a warm-up with further images. If this takes more than a few
+times as long as the live part, it ends early, and the number of minutes is reported.
 """
 
 from __future__ import annotations

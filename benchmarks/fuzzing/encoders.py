@@ -286,7 +286,7 @@ class EncoderOffsetScenario(Bench):
         self._rng = rng
 
     def violations(self) -> list[str]:
-        """Return the violations in its commands, as sentences."""
+        """Run the scenario, and return as sentences how the commands of the robot violate the rules."""
         self.say("motion", goal=self.body)
         self.run(10)
         if self._stopped:

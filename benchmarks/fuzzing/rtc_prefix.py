@@ -224,7 +224,7 @@ class PrefixKeepingPolicy(Policy):
         return np.max(bends, axis=0, initial=0.0) if bends else np.zeros(len(rows[0]))
 
     def _of(self, joints: Float64) -> Float64:
-        """Return planned joints in the space of the rows: as they are, or as poses."""
+        """Return planned joints in the space of the policy's rows: as joints, or converted to poses."""
         return self._eef.eef_of(joints).astype(np.float64) if self._made.space == "eef" else joints
 
     def _difference(self, left: Float64, right: Float64) -> Float64:

@@ -1,4 +1,4 @@
-"""First deployment file from a few choices: the choices that there are, and the text of the file."""
+"""First deployment file of a station: the choices that a person has, and the text of the file for these choices."""
 
 from __future__ import annotations
 

@@ -196,7 +196,10 @@ def _joined(spans: list[tuple[int, int]], first: int, last: int) -> list[tuple[i
 
 
 def _manifest(folder: Path) -> Mapping[str, object]:
-    """Return the manifest, which is needed only for times; {} if it is unreadable, which its digest reports."""
+    """Return the manifest, which is needed only for times; {} if it is unreadable.
+
+    An unreadable manifest is reported by the comparison with its digest.
+    """
     try:
         return read_json(folder / MANIFEST)
     except RecordingError:

@@ -54,7 +54,7 @@ class StrategyParameters(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """State on which a `Query` decides."""
+    """State from which a `Query` decides whether to send a request."""
 
     remaining: int  # steps still planned
     in_flight: bool  # a request is pending, or its chunk is not merged yet

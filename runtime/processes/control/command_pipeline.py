@@ -62,7 +62,9 @@ class _Gap:
 
 
 class CommandPipeline:
-    """Sequence behaviour, target, gripper locks, safety, actuator, executed once per tick for one robot.
+    """Pipeline of commands for one robot, executed once per tick.
+
+    Its parts are, in this order: behaviour, target, gripper locks, safety, actuator.
 
     A refused action is replaced by the next point of a braking motion, so that a command is sent on every tick. After
     too many refusals, or when actions are missing for too long, the pipeline holds. If actions are refused only because

@@ -366,7 +366,10 @@ class Runs:
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
     def record_event(self, message: Message) -> None:
-        """Send a message for the record; if media does not read, it is lost and that is logged."""
+        """Send a message to media for the record.
+
+        If media does not read the message, the message is lost, and the loss is logged.
+        """
         try:
             self._send(message)
         except RuntimeFault as error:
