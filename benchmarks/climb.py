@@ -112,7 +112,11 @@ def _told(label: str, rungs: list[_Rung], otherwise: str) -> tuple[list[Figure],
 
 
 def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds: float) -> _Rung:
-    """Open `pages` pages in all on the stations `names` for `seconds`, press in turn, and return the measured step."""
+    """Open `pages` pages on each of the stations `names` for `seconds`, and return the measured step.
+
+    Meanwhile the e-stops of the stations are pressed in turn. `count`, the number of stations or pages that this step
+    measures, is stored in the result.
+    """
     watching = [watch(running.visitor, seconds, station=name, reading=pages) for name in names]
     open_pages = [OpenPage(running.visitor, running.announced["stops"], name) for name in names]
     times_ms: list[float] = []

@@ -55,13 +55,19 @@ def measure(seconds: float) -> Report:
 
 
 def covered(case: Case, n: int, *, runs: int, draws: int) -> float:
-    """Return the share of `runs` whose interval contains the truth."""
+    """Return the share of `runs` simulated runs in which the interval contains the true value.
+
+    Each run has `n` outcomes; `draws` is passed on to the computation of the interval.
+    """
     chance = np.random.default_rng(n)
     return sum(case.holds(chance, n, draws) for _ in range(runs)) / runs
 
 
 def _mean(truth: float, draw: Callable[[Chance, int], NDArray[np.float64]]) -> Case:
-    """Return the case of the scores of one checkpoint, which `draw` generates with the mean `truth`."""
+    """Return the case in which the mean score of one checkpoint is estimated.
+
+    `draw` generates the scores, whose true mean is `truth`.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         outcomes = draw(chance, n).tolist()

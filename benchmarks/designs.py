@@ -153,7 +153,10 @@ class PartStore:
         self._done: dict[str, dict[str, Any]] = {part["name"]: part for part in map(json.loads, lines)}
 
     def once(self, name: str, part: Part, rows: Courses) -> list[Figure]:
-        """Return the figures of a part and add its rows to `rows`; they are computed only if they are not stored."""
+        """Return the figures of a part, and add its rows to `rows`.
+
+        The figures and rows are computed only if they are not stored yet.
+        """
         if name not in self._done:
             own: Courses = []
             figures = [asdict(figure) for figure in part(own)]
@@ -183,8 +186,9 @@ def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
 def powers(rows: Courses) -> Iterator[Figure]:
     """Yield the power of each design, and of scipy's Barnard test for comparison.
 
-    The power of the design "late" has to be at least that of a fixed number of pairs minus 0.05. The power of "early"
-    has to be at least that of STEP minus 0.02, with at most a tenth more pairs.
+    Two designs have requirements. The power of "late" must be at least the power of the design with a fixed number of
+    pairs, minus 0.05. The power of "early" must be at least the power of STEP minus 0.02, and its median number of
+    pairs may be at most a tenth higher than that of STEP.
     """
     for name, case in DESIGNS.items():
         for rates, n in SAME if case.margin else DIFFERENT:
@@ -203,10 +207,10 @@ def powers(rows: Courses) -> Iterator[Figure]:
 
 
 def estimates(rows: Courses) -> Iterator[Figure]:
-    """Yield the bias of the difference, raw and corrected for early stopping, and the coverage of the corrected
-    interval.
+    """Yield the bias of the estimated difference, and the coverage of the corrected interval.
 
-    Bias and coverage are computed exactly, over every table at which the design ends.
+    The bias is given for the raw estimate and for the estimate that is corrected for early stopping. Bias and coverage
+    are exact: they are sums over every table of results at which the design can end.
     """
     for name in ("late", "early"):
         exact = boundary_of(DESIGNS[name], SIZES[0])
@@ -245,9 +249,9 @@ def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, 
 
 
 def drifts(rows: Courses) -> Iterator[Figure]:
-    """Yield the largest error found for common rates that change over time; it is only reported.
+    """Yield the largest error that was found for rates that change over time, the same rate for both checkpoints.
 
-    The designs assume constant rates; `type1` is their error for those.
+    It is only reported. The designs assume constant rates; `type1` is the error of the designs under this assumption.
     """
     for name, (case, n) in DRIFTING.items():
         exact = boundary_of(case, n)
@@ -312,12 +316,14 @@ def families(rows: Courses) -> Iterator[Figure]:
 
 
 def choices(rows: Courses) -> Iterator[Figure]:
-    """Yield figures on choosing the best of several checkpoints, with all trials or with dropping.
+    """Yield figures on choosing the best of several checkpoints, either with all trials or with dropping.
 
-    `best.wrong` is how often a wrong checkpoint is called the best, `best.found` how often the right one is,
-    `best.chosen_wrong` how often the highest observed rate among the remaining checkpoints is not that of the best one,
-    and `best.trials` the median number of trials. If several checkpoints have the highest rate, to call any of them the
-    best is wrong.
+    * `best.wrong`: how often a wrong checkpoint is called the best.
+    * `best.found`: how often the right checkpoint is called the best.
+    * `best.chosen_wrong`: how often the remaining checkpoint with the highest observed rate is not the best one.
+    * `best.trials`: median number of trials.
+
+    If several checkpoints share the highest true rate, calling any of them the best is wrong.
     """
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
     for rates in _CHOICES:
@@ -349,9 +355,10 @@ def choices(rows: Courses) -> Iterator[Figure]:
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:
-    """Return the least extreme table that is significant in Barnard's test, as successes of both arms.
+    """Return the least extreme table of results that is significant in Barnard's test; None if there is none.
 
-    All more extreme tables are significant too. None if no table is significant.
+    The table is given as the numbers of successes of the two checkpoints, each with `n` trials. All more extreme tables
+    are significant too.
     """
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),

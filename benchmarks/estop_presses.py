@@ -118,7 +118,10 @@ class RestPresser:
         self._headers = {**headers, "Content-Type": "application/json"}
 
     def ready(self) -> None:
-        """Request the state of the e-stop, as a page does when it opens to test this way."""
+        """Request the state of the e-stop once.
+
+        A page does the same when it opens, to test whether presses can be sent by this way.
+        """
         self.post("GET", "estop")
 
     def press(self, why: str, identity: str = "") -> Press:

@@ -95,7 +95,8 @@ def _case(
 ) -> list[dict[str, Any]]:
     """Let the backends solve the chunks in turn, and return a row per backend.
 
-    Each backend stops after its time and its number of calls.
+    A backend stops when it has used its time and has solved each chunk often enough. `seconds` is the time of each
+    backend.
     """
     solved = {kind: [_solved(backend, chunk) for chunk in chunks] for kind, backend in backends.items()}
     times: dict[str, list[_Call]] = {kind: [] for kind in backends}

@@ -82,7 +82,10 @@ def busy_lab(
 def watch(
     visitor: RestClient, seconds: float, station: str = STATION, **counts: int
 ) -> subprocess.Popen[str]:
-    """Open pages at the station in a separate process: `reading` and `stalled` are their numbers."""
+    """Open pages at the station in a separate process for `seconds`.
+
+    `counts` has the number of pages by kind: `reading` pages draw what they receive, `stalled` pages never read.
+    """
     options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
     command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, station, visitor.cookies]
     command += ["--streams", ",".join(STREAMS), "--seconds", str(seconds), *options]
@@ -134,7 +137,10 @@ def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
 
 
 class Scheduling:
-    """Kernel scheduling of one process of a lab since creation of this object."""
+    """Statistics of how the kernel has scheduled one process of a lab since this object was created.
+
+    `module` is the module that the process runs.
+    """
 
     def __init__(self, lab: psutil.Process, module: str) -> None:
         (self._process,) = (p for p in lab.children(recursive=True) if named(p.cmdline()) == module)

@@ -1,6 +1,7 @@
-"""Effects of the measures for steady ticks: `loop` at one rate, with measures of runtime.core.realtime disabled.
+"""Effect of each of the measures by which the control process ticks punctually.
 
-The bare comparison loop runs without the same measures.
+The benchmark `loop` runs at one rate, each time with other measures of runtime.core.realtime disabled. The bare loop
+for comparison runs without the same measures.
 """
 
 from __future__ import annotations

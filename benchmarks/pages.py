@@ -126,7 +126,7 @@ def drag(selector: str) -> Control:
 def narrow(name: str, words: str = "") -> Control:
     """Return a function that filters a list by its field `name`, and waits until the list shows the filter.
 
-    It types `words`, or selects the next choice if there are none.
+    The function types `words` into the field. If `words` is "", the function selects the next choice of the field.
     """
 
     def narrowed(page: Any) -> None:

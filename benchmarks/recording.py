@@ -75,7 +75,10 @@ def figures(
     kills: Mapping[str, Any],
     listing: Mapping[str, Any],
 ) -> list[Figure]:
-    """Return the figures of the five parts, with and without requirements."""
+    """Return the figures of the five parts of the benchmark.
+
+    Some figures have a requirement, others are only reported.
+    """
     memory, disk = station["memory_mb"], station["to_disk_ms"]
     rows: Sequence[Mapping[str, Any]] = kills["rows"]
     return [
@@ -195,7 +198,10 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
 
 
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
-    """Kill each process at 10 moments, 50 if `long`; on a slow machine at fewer, but at least 10 in all."""
+    """Kill the recording processes 30 times in turn, and the worker 10 times; 150 and 50 times if `long`.
+
+    On a slow machine there are fewer kills, but together at least 10 of them. If `long`, all are made.
+    """
     recording, working = (
         (KillCount(150, 150, 0.0), KillCount(50, 50, 0.0))
         if long

@@ -1,7 +1,7 @@
 """kill -9 at random moments during recording and publishing: losses, and whether all files can be opened.
 
-Media, coordinator, control and reception are killed in turn, each in a recorded run, and the worker during its jobs.
-The killer measures the time of a kill, on the clock of the rows.
+Media, coordinator, control and reception are killed in turn, each in a recorded run. The worker is killed during its
+jobs. The program that kills measures the time of each kill on the clock that also gives the rows their times.
 """
 
 from __future__ import annotations

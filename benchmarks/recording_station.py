@@ -216,7 +216,11 @@ def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> d
 
 
 def published(episode: Path, dataset: Path, frames: int) -> dict[str, Any]:
-    """Publish by the command line; return the duration, and how many encoded frames differ from the recording."""
+    """Publish an episode into a dataset by the command line.
+
+    Return the duration, and the number of encoded frames, of the first `frames` of each video, that differ from the
+    recording.
+    """
     command = [sys.executable, "-m", "runtime.datasets", "publish", str(episode), "--to", str(dataset)]
     command.append("--include-interrupted")  # measure it even if the run failed on a busy machine
     begun = time.monotonic()

@@ -115,7 +115,10 @@ def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
 
 
 def rule_figures(runs: int) -> Iterator[Figure]:
-    """Yield how often the stopping rule, and a reader who tests at every look, separate equal checkpoints."""
+    """Yield how often equal checkpoints are declared different.
+
+    This is given for the stopping rule, and for comparison for a reader who tests for a difference at every look.
+    """
     for rate in RATES:
         chance = random.Random(f"{rate}")
         false_positives = naive = 0

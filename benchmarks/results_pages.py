@@ -311,7 +311,12 @@ def _made(trial: Any, operator: Any) -> None:
 
 
 def _out_of_order(handed: Sequence[tuple[int, int, int]]) -> int:
-    """Return the number of blocks that began out of order, changed their station, or had two stations."""
+    """Return how often the order of the trials was violated.
+
+    `handed` has for each trial, in the order in which the trials were handed out, its index in the plan, its block and
+    its station. Three violations are counted: a block began before an earlier block, a station received a trial before
+    an earlier one, or a block had more than one station.
+    """
     begun = list(dict.fromkeys(block for _, block, _ in handed))
     wrong = sum(first > second for first, second in pairwise(begun))
     for station in {station for *_, station in handed}:

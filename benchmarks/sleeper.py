@@ -36,7 +36,10 @@ def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[
 
 
 def _deadlines(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep repeatedly until start + n * period; missed deadlines are skipped. Return the wake-ups."""
+    """Sleep repeatedly until start + n * period; missed deadlines are skipped.
+
+    Return three lists with an entry per wake-up: its time [s], the number n of the step, and its lateness [s].
+    """
     clock = MonotonicClock()
     woke: list[float] = []
     steps: list[int] = []

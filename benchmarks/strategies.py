@@ -1,23 +1,28 @@
 """Quality of strategies with known policy actions: offset, error, jerk, reaction, starvation.
 
 The parts of the strategies (query, merge, timeline, conditioning) run in integer steps in benchmarks/step_loop.py,
-without processes, wire, safety or robot lag: deterministic, and fast enough for every cell. `checked_in_lockstep` is
-the number of actions that the complete station in lockstep (benchmarks/strategy_station.py) planned for the same
-policy; `different_in_lockstep` is how many of them the step loop does not reproduce bit by bit.
+without processes, wire, safety or robot lag. This is deterministic, and fast enough for every cell.
+`checked_in_lockstep` is the number of actions that the complete station in lockstep (benchmarks/strategy_station.py)
+planned for the same policy. `different_in_lockstep` is how many of these actions the step loop does not reproduce bit
+by bit.
 
-A cell is infeasible if a chunk ends before the next one can arrive: H < delay + query interval, with the interval the
-longer of 1 / rate and delay + 1 ticks (a chunk is requested on the tick after the last one arrived). Its figures are
-in the rows, but in no summary except `unrecovered_starvations`. `sync` waits, and is always feasible.
+A cell is one combination of parameters. It is infeasible if a chunk ends before the next one can arrive, which is the
+case if H < delay + query interval. The query interval is the longer of 1 / rate and delay + 1 ticks, because a chunk is
+requested on the tick after the last one arrived. The figures of an infeasible cell are in the rows, but in no summary
+except `unrecovered_starvations`. The strategy `sync` waits for each chunk, so its cells are always feasible.
 
-* `offset_steps`: delay of the published actions in steps, from the numbers alone and not from what merging reports:
-  the fractional shift of the reference that fits them best (least squares). For `sync` the reference of a chunk is
-  that of its request, from the step on which its first row is executed.
-* `rms_error` [rad]: published action compared with the reference at the same moment, also for `sync`.
+* `offset_steps`: delay of the published actions in steps. It is measured from the actions alone, not from what merging
+  reports: it is the fractional shift of the reference that fits the actions best (least squares). For `sync` the
+  reference of a chunk begins at the request of this chunk, and counts from the step on which the chunk's first row is
+  executed.
+* `rms_error` [rad]: difference of the published action and the reference at the same moment, also for `sync`.
 * `jerk_ratio`: 95th percentile of the third difference of the published actions, relative to that of the reference.
-* `..._disagreeing`: the same with a constant offset per chunk of up to 0.02 rad, which makes seams visible.
-* `reaction50/90/99`: steps from a change of intention by 1 rad until that percentage of it is published. The worst of
-  four changes, the first right after a request was sent, the others distributed over the interval.
-* `starved`: steps without a plan. `spike`: the same if one answer takes longer than the chunk lasts.
+* `..._disagreeing`: the same figure for chunks that each have a constant offset of up to 0.02 rad, which makes seams
+  visible.
+* `reaction50/90/99`: steps from a change of intention by 1 rad until 50, 90 or 99 % of the change is published. It is
+  the worst of four changes. The first change comes right after a request was sent; the others are distributed over the
+  interval.
+* `starved`: steps without a plan. `spike`: the same figure if one answer takes longer than the chunk lasts.
 """
 
 from __future__ import annotations
@@ -115,7 +120,10 @@ class Tracked:
 
 
 def measure(seconds: float) -> Report:
-    """Measure all figures; `seconds` is the budget of the moving target alone, the cells have no time limit."""
+    """Measure all figures.
+
+    `seconds` is the time for the measurement of the moving target alone; the cells have no time limit.
+    """
     cells = [Cell(*values) for values in product(KINDS, CONTROLS, RATES, HORIZONS, DELAYS)]
     with ProcessPoolExecutor(2) as pool:
         rows = list(pool.map(_row, cells, chunksize=20))
@@ -225,7 +233,10 @@ def _offset(reference: Reference, cell: Cell, log: Log, begin: int) -> float:
 
 
 class _Mind:
-    """Intention that is 0 or 1 for all coming steps, whatever it was before; it can be changed at any time."""
+    """Intention of the policy: the same value, 0 or 1, for all coming steps.
+
+    The value does not depend on earlier values, and can be changed at any time.
+    """
 
     def __init__(self, horizon: int) -> None:
         self.value = 0.0

@@ -81,7 +81,7 @@ class TablePolicy(Policy):
         return ActionChunk(self._answer(observation.step - self.first, conditioning).astype(np.float32))
 
     def reset(self) -> None:
-        """Let the next observation be the first one."""
+        """Count the steps of the table from the next observation on."""
         self.first = -1
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""Open pages at a station, all in this process: `python -m benchmarks.viewers URL STATION COOKIE ...`.
+"""Program that opens pages at a station, all in this process: `python -m benchmarks.viewers URL STATION COOKIE ...`.
 
-Prints a line of JSON: the age of every snapshot on arrival at a viewer [ms], and the frames per viewer.
+It prints a line of JSON: the age of every snapshot on arrival at a viewer [ms], and the frames per viewer.
 """
 
 from __future__ import annotations

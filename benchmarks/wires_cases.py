@@ -175,14 +175,14 @@ def _zmq(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _ros2(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case of ROS 2 with images as JPEG, as the robot publishes them."""
+    """Set up the benchmark case of ROS 2 with images as JPEG, as the robot publishes them."""
     domain = stage.stack.enter_context(free_domain())
     stage.send("ros2_node", "--robot", stage.robot, "--domain", str(domain), *stage.sized())
     return CaseEndpoints({"kind": "ros2", "domain": domain})
 
 
 def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case of ROS 2 with raw pixels from the same robot."""
+    """Set up the benchmark case of ROS 2 with images as raw pixels, from the same robot."""
     folder = stage.folder / stage.robot
     shutil.copytree(ROOT / "robots" / stage.robot, folder)
     described = (folder / "robot.toml").read_text("utf-8")

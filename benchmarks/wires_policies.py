@@ -49,7 +49,11 @@ _PEER = "openpi-client"
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Protocol to measure, by its name in `runtime.standins.serve`: our settings, and options of the server."""
+    """Policy protocol to measure.
+
+    `name` is its name in `runtime.standins.serve`. `settings` are the settings of our client, and `options` the options
+    of the stand-in server.
+    """
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)

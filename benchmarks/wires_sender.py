@@ -30,9 +30,10 @@ _LOOK_S = 0.0005
 
 
 class Pace:
-    """Limit that keeps a sender at most a few images ahead of `arrived`.
+    """Limit that keeps a sender at most a few images ahead of the receiver.
 
-    An image that has not arrived after `patience` [s] counts as lost.
+    `arrived` returns the number of images that have arrived. An image that has not arrived after `patience` [s] counts
+    as lost.
     """
 
     def __init__(self, arrived: Callable[[], int], clock: Clock, patience: float = 0.05) -> None:
@@ -84,7 +85,14 @@ class TimestampingCameraServer(MjpegServer):
 
 @exit_on_broken_pipe
 def main(file: str, shared: str, module: str, *arguments: str) -> int:
-    """Run the sender until its end; return the exit code of the simulated robot."""
+    """Run the sender until its end; return the exit code of the simulated robot.
+
+    Args:
+        file: File to which the start times of messages are written.
+        shared: Descriptor of the shared state of the receiver; "" if the sender need not keep pace with it.
+        module: Module of the simulated robot in `runtime.simulation`, or "cameras".
+        arguments: Arguments of the simulated robot, or of the cameras.
+    """
     if module == "cameras":
         return _cameras(Path(file), arguments)
     simulated = importlib.import_module(f"runtime.simulation.{module}")

@@ -3,10 +3,12 @@
 Sender, receiving side (`benchmarks.wires_receiver`, like reception) and control loop are separate processes. The
 control loop is this process: it polls shared state at 100 Hz, so that its readings are uniformly distributed between
 two images. Live images of 640x480 arrive at 30 Hz. Their age is the time since the sender began to draw and encode
-them, which is known by their number; the age of images of recordings, which have no sender, is the time since they were
-due. Afterwards another receiving side receives the images of ten idle minutes as fast as possible, and its memory
-growth since the first of them is reported. If this takes more than a few times as long as the live part, it ends early,
-and the number of minutes is reported.
+them; the number in the image shows when that was. Images of recordings have no sender: their age is the time since they
+were due.
+
+Afterwards another receiving side receives, as fast as possible, as many images as arrive in ten minutes of idling. The
+growth of its memory is reported, counted from the end of a warm-up with further images. If this takes more than a few
+times as long as the live part, it ends early, and the number of minutes is reported.
 """
 
 from __future__ import annotations
@@ -170,7 +172,15 @@ def number_marks(picture: UInt8) -> UInt8:
 
 
 def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
-    """Return for each tick the age of the oldest image [s]; None if an image was being overwritten."""
+    """Return for each tick the age of the oldest image [s].
+
+    The age is None if the start time of any image is unknown, because this image was being overwritten.
+
+    Args:
+        looks: For each tick, what the control loop read from each camera.
+        born: How the start time of an image is found: "due", "strip" or another word, see `_birth`.
+        sent: Start times recorded by the sender.
+    """
     ages: list[float | None] = []
     for reading in looks:
         births = [_birth(index, *entry, born, sent) for index, entry in enumerate(reading)]
@@ -189,7 +199,12 @@ def sent_hz(sent: Any, begun: float, took: float) -> float | None:
 def _birth(
     camera: int, marks: UInt8 | None, captured: float, now: float, born: str, sent: Any
 ) -> float | None:
-    """Return when the sender began an image [s]; None if its marks could not be read."""
+    """Return when the sender began an image [s]; None if the marks of the image could not be read.
+
+    `born` names how this time is found. "due": the image has no sender and began when it was due, at `captured`.
+    "strip": the number in the strip of the image is an index of `sent`. Otherwise the time comes from the bar of the
+    image and the start times `sent` of the camera.
+    """
     if born == "due":
         return captured
     if marks is None:

@@ -82,7 +82,10 @@ class Body:
         return tuple(links[link] for links in self._links if link in links)
 
     def link_of(self, group: str, link: str) -> int:
-        """Return the index of a link in the copy of the tree that a group moves.
+        """Return the index of a link.
+
+        A robot may contain several copies of the same kinematic tree, each moved by other groups. The link `link` is
+        taken from the copy that `group` moves.
 
         Raises:
             RobotError: If it does not exist; the message lists the links.

@@ -62,9 +62,11 @@ class Clearance:
     The pairs are: links of different arms, links of one body, and links with the table (plane z = 0 of the scene).
     Excluded, because they are not informative:
 
-    * links with at most one of the robot's joints between them (not counting grippers and joints that no group moves);
-      of two arms with separate roots, links that nothing moves;
-    * pairs that touch at nearly every posture (95 %), as in a wrist, in this arm or in its equal copies;
+    * two links with at most one of the robot's joints between them (not counting grippers and joints that no group
+      moves);
+    * two links of arms with separate roots, if nothing moves these links;
+    * pairs that touch at nearly every posture (95 %), as in a wrist, either in this arm or in the other arms that are
+      equal to it;
     * the table for parts that no arm or hand moves (a torso next to it) or that only rotate about the vertical;
     * everything in collision.ignore and collision.without of robot.toml.
     """
@@ -115,8 +117,10 @@ class Clearance:
         return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
 
     def touch_thresholds(self, margin: float) -> Float64:
-        """Return the distances [K] below which pairs count as touching: `margin`, or a negative one for fingers and
-        table.
+        """Return the distances [K] below which pairs count as touching.
+
+        The distance is `margin`, except for fingers and the table: fingers may be slightly below the table, so their
+        threshold is negative.
         """
         least = np.full(len(self.pairs), margin)
         least[len(self._first) :][self._fingers[self._over]] = -_DIP
@@ -163,7 +167,10 @@ def get_clearance(robot: Robot) -> Clearance:
 
 
 def _mirror_key(pair: tuple[str, str]) -> tuple[str, ...]:
-    """Return a key that the corresponding pairs of equal arms share; for a pair of two arms, the pair itself."""
+    """Return a key that is the same for corresponding pairs of links in arms that are equal.
+
+    For a pair of links of two different arms, the key is the pair itself.
+    """
     (group, _, link), (other_group, _, other_link) = (name.partition("/") for name in pair)
     return (link, other_link or other_group) if group == other_group or not other_link else pair
 

@@ -90,8 +90,10 @@ def mesh_bounds(path: Path) -> Bounds:
 
 
 def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
-    """Yield the paths in `root` at which the file may be; a package is the folder with its name there, or `root`
-    itself.
+    """Yield the paths in `root` at which the mesh file `filename` of a URDF may be.
+
+    A path of the form package://NAME/... is searched in the folder NAME of `root`, and in `root` itself. `owner` names
+    the robot in errors.
     """
     scheme, separator, path = filename.partition("://")
     if not separator:

@@ -46,7 +46,8 @@ class Gripper:
 class Group:
     """Joints that are sent together; `joints` are their names in messages, `slice` their indices in the robot's vector.
 
-    `urdf_joints` name the same joints in the URDF, without the gripper, "" for numbers that move no link.
+    `urdf_joints` are the names of the same joints in the URDF, without the gripper. The name is "" for a number that
+    moves no link.
 
     An arm has an end effector `eef_link`, whose pose is stated in `frame`. Its `chain` contains only its own joints,
     and usually begins at `frame`. If joints of other groups (a torso) lie between `frame` and the arm, they form the

@@ -116,8 +116,8 @@ def quaternion_product(left: Float64, right: Float64) -> Float64:
 def slerp(start: Float64, end: Float64, part: Float64) -> Float64:
     """Return the unit quaternions [..., 4] at the share `part` [...] of the shorter path from `start` to `end`.
 
-    Their signs are those of the hemisphere of `start`. Shoemake 1985, with the angle by atan2, because the arc cosine
-    of a number near 1 loses half its digits.
+    Each result is in the hemisphere of `start`, which decides its sign. Source: Shoemake 1985. The angle is computed by
+    atan2, because the arc cosine of a number near 1 loses half its digits.
     """
     end = np.where(np.sum(start * end, axis=-1, keepdims=True) < 0, -end, end)
     apart, along = np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1)

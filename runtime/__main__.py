@@ -90,7 +90,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _resolved(options: argparse.Namespace) -> Resolved:
-    """Return the deployment of the file, or of the earlier run, whose differences from that run are printed.
+    """Return the deployment from the file, or from an earlier run.
+
+    If the deployment is that of an earlier run, the differences from this run are printed.
 
     Raises: ConfigurationError.
     """

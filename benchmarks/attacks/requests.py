@@ -96,7 +96,7 @@ def _body(target: Target, number: int) -> str:
 
 
 def toml(target: Target) -> Counter[str]:
-    """Import, as an administrator, a file with a key, or a table, of twenty thousand parts."""
+    """Import, as an administrator, a TOML file in which a key, or the name of a table, has twenty thousand parts."""
     visitor = target.visitor("admin")
     return again_and_again(target, 1, partial(_import, visitor))
 

@@ -56,7 +56,7 @@ _PROTOCOLS = (
 
 
 def once(seed: int) -> list[str]:
-    """Send requests to the server that the seed determines; return each violation as a sentence."""
+    """Send requests to a server whose protocol `seed` determines; return each violation as a sentence."""
     random = np.random.default_rng(seed)
     chosen = _PROTOCOLS[int(random.integers(len(_PROTOCOLS)))]
     values = random.permutation(np.linspace(0.1, 1.3, _QUESTIONS))

@@ -1,4 +1,7 @@
-"""Robots for fuzzers: the limits of their numbers, sometimes with all groups, or with joints without limits."""
+"""Robots for fuzzers, described by the limits of their numbers.
+
+Some are drawn with all of their groups, some with joints that have no limits.
+"""
 
 from __future__ import annotations
 

@@ -216,8 +216,9 @@ class Scenario(Bench):
     def _check_grippers(self, action: Float64, stopped: bool) -> None:
         """Check that grippers are commanded open or closed, and do not switch too often.
 
-        `action` [D] is the command of this tick. A gripper may be commanded to a position in between if its command
-        does not change, or in the first command of all if that is the one of an e-stop (`stopped`).
+        `action` [D] is the command of this tick. A gripper may be commanded to a position in between in two cases: if
+        the command for this gripper does not change, or if this is the first command of the scenario and the e-stop is
+        pressed (`stopped`).
         """
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]
@@ -285,7 +286,7 @@ class EncoderOffsetScenario(Bench):
         self._rng = rng
 
     def violations(self) -> list[str]:
-        """Return the violations in its commands, as sentences."""
+        """Run the scenario, and return as sentences how the commands of the robot violate the rules."""
         self.say("motion", goal=self.body)
         self.run(10)
         if self._stopped:

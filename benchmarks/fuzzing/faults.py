@@ -1,4 +1,7 @@
-"""Encoder faults, each a function that returns readings instead of `joints` [D], `since` samples after it began."""
+"""Encoder faults: each is a function that returns faulty readings in place of the true `joints` [D].
+
+`since` is the number of samples since the fault began.
+"""
 
 from __future__ import annotations
 

@@ -162,7 +162,9 @@ class PrefixKeepingPolicy(Policy):
         return PolicyInfo("keeper", horizon=self._made.horizon, rate=self._made.action_hz, supports_rtc=True)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return rows around the posture; if the contract is honoured, the committed rows come first.
+        """Return random rows around the robot's posture.
+
+        If the scenario says that this policy keeps its prefix, the rows begin with the committed rows of the request.
 
         Raises:
             PolicyLostError: At random.
@@ -222,7 +224,7 @@ class PrefixKeepingPolicy(Policy):
         return np.max(bends, axis=0, initial=0.0) if bends else np.zeros(len(rows[0]))
 
     def _of(self, joints: Float64) -> Float64:
-        """Return planned joints in the space of the rows: as they are, or as poses."""
+        """Return planned joints in the space of the policy's rows: as joints, or converted to poses."""
         return self._eef.eef_of(joints).astype(np.float64) if self._made.space == "eef" else joints
 
     def _difference(self, left: Float64, right: Float64) -> Float64:
@@ -234,7 +236,10 @@ class PrefixKeepingPolicy(Policy):
         return difference(left, right, (0,) if self._made.endless else ())
 
     def _wandering(self, observation: Observation) -> Float64:
-        """Return a random smooth path around the posture, with quaternion signs as servers answer."""
+        """Return a random smooth path around the robot's posture.
+
+        Quaternions have the signs that a policy server would send.
+        """
         robot, random = self._robot, self._random
         rate = self._made.action_hz or self._made.control_hz
         seconds = observation.step / self._made.control_hz + np.arange(self._made.horizon) / rate
@@ -293,9 +298,10 @@ class Planned:
     end: int
 
     def arrived_for(self, step: int) -> int:
-        """Return the step from which on the plan uses an answer to a request that was made at `step` or later.
+        """Return the first step at which the plan uses an answer to a request made at `step` or later.
 
-        If no such answer arrived, return the end of the run: lost answers fix nothing.
+        If no such answer arrived, return the end of the run, because an answer that was lost does not fix any row of
+        the plan.
         """
         return min((at for observed, at in self.arrived.items() if observed >= step), default=self.end)
 

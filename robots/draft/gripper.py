@@ -168,10 +168,10 @@ class _Jaws:
     def opening(
         self, fingers: Mapping[str, tuple[float, float]], lower: float, upper: float
     ) -> tuple[float | None, dict[str, float], float]:
-        """Return the distance by which the fingers part [m], the joints' values when closed, and the driver's value
-        when open.
+        """Return how far the fingers part [m], the joints' values when closed, and the driver's value when open.
 
-        The distance is None if they do not part.
+        The distance is None if the fingers do not part. `fingers` has for each joint its values at the two limits of
+        the driver. `lower` and `upper` are the driver's limits.
         """
         partings = self._partings(fingers)
         pair = self._pairs[int(np.argmax(partings))]
@@ -187,8 +187,10 @@ class _Jaws:
     def tip(self, closed: Mapping[str, float], *, named: bool) -> Float64:
         """Return the frame [7] between the fingertips in the end effector: z ahead, y in the opening direction.
 
-        Its position comes from the fingers' shapes. Without shapes it is the origin of the end effector if that is
-        `named` like a frame for grasping, else midway between the ends of the fingers.
+        The position of the frame comes from the shapes of the fingers. Without shapes there are two cases. If `named`,
+        which means that the end effector's name is that of a frame for grasping, the position is the origin of the end
+        effector. Otherwise the position is midway between the ends of the fingers. `closed` has the values of the
+        joints when the gripper is closed.
         """
         at = self._in_eef(closed)
         points = [self._point(index, at) for index in range(len(self._ends))]

@@ -118,9 +118,10 @@ class _Skeleton:
         return carriers
 
     def runs(self, without: set[str]) -> list[tuple[tuple[str, ...], bool]]:
-        """Return the unbranched rows of joints, outwards, without the joints in `without`.
+        """Return the unbranched sequences of joints, without the joints in `without`.
 
-        Each row comes with True if no joint follows its last one.
+        The joints of a sequence are in order from the root outwards. The second element of each pair is True if no
+        joint follows the last joint of the sequence.
         """
         result: list[tuple[tuple[str, ...], bool]] = []
         starts = self.children(None, without)

@@ -85,7 +85,8 @@ class PostureSearch:
     def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
         """Return the posture with as many joints as possible moved back to their home values.
 
-        One joint after the other is moved, and stays there if not more than `fewest` links touch then.
+        The joints are tried one after the other. A joint keeps its home value if at most `fewest` links touch each
+        other with it.
         """
         for dim in self._dims():
             tried = q.copy()
@@ -214,9 +215,10 @@ class PostureSearch:
         return 1.0 if x > _NEAR else -1.0
 
     def _mirrored(self, arm: Group, q: Float64) -> Float64:
-        """Return the postures [..., D] with this arm as the mirror image of the first one, within its limits.
+        """Return the postures `q` [..., D] with the joints of `arm` set to the mirror image of the first arm.
 
-        They are unchanged if the two arms are not mirror images of each other.
+        The joints of `arm` are kept within its limits. The postures are returned unchanged if the two arms are not
+        mirror images of each other.
         """
         if arm.name not in self._signs:
             return q

@@ -1,4 +1,4 @@
-"""First deployment file from a few choices: the choices that there are, and the text of the file."""
+"""First deployment file of a station: the choices that a person has, and the text of the file for these choices."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ class Entry:
 
     @property
     def address(self) -> bool:
-        """Whether the key is an address or similar, which has no useful default, so that its value is asked first."""
+        """Whether the value of the key is asked first.
+
+        This is so for addresses and similar values, which have no useful default, and for all required keys.
+        """
         return (
             self.required
             or self.key in ("url", "network", "master", "address", "domain", "user")

@@ -191,7 +191,11 @@ class ClockMap:
         self.leaps = 0
 
     def map(self, stamp: float, arrival: float, steps: ClockStepDetector | None = None) -> float:
-        """Return the peer's `stamp` on our clock, never later than `arrival`; `steps` is the detector of its stream."""
+        """Return the peer's `stamp` on our clock, never later than `arrival`.
+
+        `steps` detects steps of the peer's clock in the stream that the stamp belongs to; None selects the detector of
+        this map.
+        """
         offset = arrival - stamp
         least = self._minima[0][1] if self._minima else math.inf
         step = (steps or self._steps).update(stamp, arrival, least)

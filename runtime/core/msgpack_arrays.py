@@ -27,11 +27,11 @@ _SCALARS = (bool, int, float, str, bytes)
 def pack(value: object) -> bytes:
     """Return `value` as one message.
 
-    Tuples become lists. float64, str_ and bytes_ scalars are packed as plain numbers and strings, because for msgpack
-    they are Python's own types.
+    Tuples become lists. float64, str_ and bytes_ scalars are packed as plain numbers, strings and bytes, because numpy
+    derives these types from Python's own types and msgpack accepts them as such.
 
     Raises:
-        CodecError: the dialect cannot represent the value.
+        CodecError: the format cannot represent the value.
     """
     try:
         packed: bytes = msgpack.packb(value, default=_encode)

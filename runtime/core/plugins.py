@@ -64,10 +64,11 @@ class UnreadSection(BaseModel):
 
 
 class KindUnion:
-    """Type of a deployment's table whose entry `kind` names a module of a package, for example a policy's protocol.
+    """Type of a table in a deployment file whose key `kind` names a module, for example a policy's protocol.
 
-    The table is checked by the model of its kind, whose module is imported only then. If the validation context lists
-    the package under `unread`, its tables are not checked: each becomes an UnreadSection.
+    The modules of all kinds are in one package. A table is checked by the model of its kind, and the module of this
+    kind is imported only then. If the validation context lists the package under `unread`, tables of this package are
+    not checked: each becomes an UnreadSection.
     """
 
     package: ClassVar[str]

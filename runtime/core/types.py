@@ -54,19 +54,21 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class ActionChunk:
-    """Response of a policy: rows of actions, row 0 for the step of the observation.
+    """Response of a policy: rows of actions, of which row 0 is for the step of the observation.
 
-    `actions` is float32 [H, W] in `space`, in the robot's units: "joint" rows are [D] in group order, "eef" rows are
-    poses in the format `pose` (None: 8 values per arm). `rate` is the rate of the rows [Hz], None: the control rate.
-    `timing` has the server's own times [ms].
+    `actions` is float32 [H, W] in `space`, in the robot's units. "joint" rows are [D] in group order. "eef" rows are
+    poses in the format `pose`; if `pose` is None, they have 8 values per arm. `rate` is the rate of the rows [Hz]; None
+    means the control rate. `timing` has the server's own times [ms].
 
-    `model_actions` are the same rows in the form in which the server continues them: in the model's normalised space,
-    or before the conversion to the robot's units. None: as in `actions`. `model_relative` is True if `model_actions`
-    are relative to the observation whatever `mode` is, False if not, None if that is unknown.
+    `model_actions` has the same rows in the form that the server needs to continue them: in the model's normalised
+    space, or as they were before the conversion to the robot's units. It is None if that form is the same as in
+    `actions`. `model_relative` is True if `model_actions` are relative to the observation whatever `mode` is, False if
+    they are not, and None if that is unknown.
 
-    `mode`: "absolute" targets; "relative" to the observation that the chunk answers; "delta": each row relative to its
-    predecessor, the first to the observation. Grippers are absolute in every mode. `frame` is that of relative poses:
-    offsets along the axes of the frame in which poses are declared ("base"), or of the observed end effector ("tool").
+    `mode` is one of three. "absolute" rows are targets. "relative" rows are relative to the observation that the chunk
+    answers. Each "delta" row is relative to its predecessor, and the first row to the observation. Grippers are
+    absolute in every mode. `frame` is the frame of relative poses. Their offsets are along the axes of the frame in
+    which poses are declared ("base"), or of the observed end effector ("tool").
     """
 
     actions: Float32

@@ -173,8 +173,9 @@ def table(columns: Columns, features: Mapping[str, Feature]) -> pa.Table:
 def column_statistics(columns: Columns, features: Mapping[str, Feature]) -> dict[str, Statistic]:
     """Return the statistics of every stored column that can have them.
 
-    Strings cannot. A column with "image" in its name gets none either: LeRobot treats such an entry as one of images
-    and refuses the dataset if its shape differs.
+    Columns of strings have no statistics. A column with "image" in its name gets none either: LeRobot would treat the
+    statistics of this column as those of an image, and refuse the dataset if their shape is not that of image
+    statistics.
     """
     statistics = {}
     for key, feature in stored_features(features).items():

@@ -40,11 +40,11 @@ def copy_with_uuids(
     reencode: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> Dataset:
-    """Return the dataset at `target` with a uuid for each episode: a copy of `dataset`, or itself if both are one
-    folder.
+    """Return the dataset at `target`, in which each episode has a uuid.
 
-    A copy keeps the version, except that v2.0 becomes v2.1; it appears complete or not at all. An existing `target` is
-    used if its episodes have the same uuids.
+    It is a copy of `dataset`, or `dataset` itself if both are the same folder. A copy keeps the version, except that
+    v2.0 becomes v2.1; it appears complete or not at all. An existing `target` is used if its episodes have the same
+    uuids.
 
     Args:
         dataset: Folder of the dataset.

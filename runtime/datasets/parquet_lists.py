@@ -60,9 +60,9 @@ def read_tasks(root: Path) -> list[Line]:
 
 
 def episode_files(lines: Sequence[Line], statistics: Sequence[Line]) -> dict[str, bytes]:
-    """Return the content of the files of meta/episodes by name.
+    """Return the content of the files of meta/episodes, by name.
 
-    Each of `lines` names its file and gets the statistics of its episode added.
+    Each of `lines` is a row of the file that the line names. The statistics of its episode are added to the row.
     """
     by_index = {line["episode_index"]: line["stats"] for line in statistics}
     files: dict[tuple[int, int], list[Line]] = {}

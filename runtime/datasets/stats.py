@@ -49,7 +49,10 @@ def finite(rows: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def fault(statistic: object, shapes: Sequence[tuple[int, ...]]) -> str:
-    """Return why a statistic is unusable, "" if it is usable; each figure must have one of `shapes`."""
+    """Return why a statistic is unusable, "" if it is usable.
+
+    Each of the figures in it, such as the mean, must be finite and have one of `shapes`.
+    """
     if not isinstance(statistic, Mapping):
         return f"is {statistic!r:.80}, expected {', '.join(FIGURES)} and count"
     for name in FIGURES + tuple(name for name in QUANTILES if name in statistic):

@@ -175,7 +175,10 @@ def _fields(parts: Sequence[str]) -> dict[str, Any]:
 
 
 def _loosely(text: str, keys: Sequence[str]) -> bool:
-    """Return True if the text contains one of `keys` with a press as its value, even if it is not valid JSON."""
+    """Return True if the text has one of `keys` with the name of an e-stop press as the value of the key.
+
+    The text need not be valid JSON.
+    """
     bare = _ESCAPED.sub(lambda code: chr(int(code[1], 16)), text).replace("\\", "")
     return re.search(_LOOSE % "|".join(keys), bare) is not None
 

@@ -25,7 +25,11 @@ NO_SUBSCRIBER, ALL_SUBSCRIBED = "commands_unheard", "commands_heard"
 
 
 def _complete(message: Any, name: str) -> None:
-    """Complete a message's sentence: fill `id` and `arguments` from it, or rebuild it from a received id."""
+    """Complete the sentence in the field `name` of a message.
+
+    For a sentence of our own, its id and arguments are stored in the fields `id` and `arguments`. For a received text,
+    the sentence is rebuilt from the received `id` and `arguments`.
+    """
     text = getattr(message, name)
     if not isinstance(text, sentences.Sentence):
         text = sentences.from_wire(text, message.id, message.arguments)

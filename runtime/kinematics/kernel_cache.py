@@ -74,7 +74,10 @@ def forget() -> bool:
 
 
 def _kernels(cache: Path) -> dict[str, int]:
-    """Return the sizes by name of the files with machine code that also have an index file of numba."""
+    """Return the sizes [bytes] of the files with machine code, by name.
+
+    A file counts only if numba's index file for its function exists too and is not empty.
+    """
     return {
         file.relative_to(cache).as_posix(): file.stat().st_size
         for file in sorted(cache.rglob("*.nbc"))

@@ -109,7 +109,7 @@ class _ArmTask(NamedTuple):
 
 
 class _Arm:
-    """One arm for PyRoki: the serial chain of its own joints, and the scan over a chunk."""
+    """One arm for PyRoki: the serial chain of its own joints, and the compiled loop that solves a chunk."""
 
     def __init__(self, libraries: _Libraries, robot: Robot, group: Group, config: Config) -> None:
         assert group.chain is not None  # it is an arm
@@ -158,9 +158,10 @@ class _Arm:
         return reference, steps
 
     def _cut(self, q: Float64, task: _ArmTask, steps: Float64, reference: Float64) -> Float64:
-        """Return the rows [T, n], clipped in float64 to joint limits and to the largest `steps` between rows.
+        """Return the rows [T, n], clipped in float64 to the joint limits and to the largest steps between rows.
 
-        The anchor's row is clipped to its step from `reference`.
+        `steps` has the largest step of each row from the row before it. The anchor's row is the exception: it is
+        clipped to the step that it may have from `reference`, not from the row before it.
         """
         cut = np.clip(q, self._lower, self._upper)
         for row in range(len(cut)):

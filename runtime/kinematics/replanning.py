@@ -1,4 +1,7 @@
-"""Replanning of a chunk that misses poses or ends near limits, backwards from its end."""
+"""Replanning of a chunk that misses poses or ends near limits.
+
+The search begins with the last pose of the chunk and goes backwards to the first.
+"""
 
 from __future__ import annotations
 

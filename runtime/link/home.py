@@ -1,6 +1,8 @@
-"""Episodes of one station on its own computer: not yet sent, verified by the lab, or removable.
+"""Episodes of one station on its own computer.
 
-DATA/uploads/STATION/UUID.json     receipt: digest that the lab has verified, when, and the digest of its labels
+An episode has not been sent yet, has been verified by the lab, or may be removed.
+
+DATA/uploads/STATION/UUID.json     receipt: the digest that the lab has verified, and when; the digest of the labels
 DATA/episodes/.leaving/UUID/       episode that is being removed
 """
 

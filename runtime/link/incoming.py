@@ -427,7 +427,10 @@ class Shelf:
     # --- labels --------------------------------------------------------------------------------------------------
 
     def _labelled(self, episode: str, lines: bytes) -> Message:
-        """Store label lines if they extend the lab's lines; otherwise decline them and change nothing."""
+        """Store the label lines of an episode if they extend the lines that the lab has; return the confirmation.
+
+        Otherwise nothing is changed, and _Unwanted is raised, which declines the lines.
+        """
         if not is_episode(episode) or len(lines) > LARGEST_LABELS:
             raise _Unwanted(
                 f"{len(lines)} bytes of labels; allowed: {LARGEST_LABELS}, of an episode", _NEVER_S

@@ -1,4 +1,7 @@
-"""Streams of linked stations at the lab, which publishes them like a station and requests them if they are subscribed.
+"""Streams of linked stations, at the lab's end of the link.
+
+The lab publishes the streams of a linked station as a station publishes its own. It requests a stream from the station
+while the stream has subscribers at the lab.
 
 The second port has its own thread and ZMQ context, so that pictures delay no command. A station sends as many bundles
 as it has credit for; each bundle passed on renews its credit. Episodes arrive here too, for `incoming.py`.

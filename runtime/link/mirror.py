@@ -89,7 +89,10 @@ class Mirror:
 
     @property
     def waiting(self) -> bool:
-        """True if messages are queued although their socket will not become readable again."""
+        """True if messages are queued in the mirror although their socket does not become readable again.
+
+        The messages were taken from the socket before, so polling the socket does not show them.
+        """
         return self.estop_turns.has_waiting or (
             self.command_turns is not None and self.command_turns.has_waiting
         )

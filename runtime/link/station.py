@@ -73,7 +73,7 @@ class Commands:
         self._connection = 0
 
     def turn(self) -> None:
-        """Wait for the lab or the station, and pass on their messages."""
+        """Wait for messages from the lab or the station, and pass them on."""
         wait_ms = _POLL_MS if self._relay.is_pending else _IDLE_MS
         poller = zmq.Poller()
         for socket in (self._line.socket, *self._relay.sockets()):
@@ -149,7 +149,11 @@ class Streams:
         return line, Flow(self._context, source_of(place.station_dir, role))
 
     def turn(self, wait_ms: int = _IDLE_MS) -> None:
-        """Wait for the lab or the station, and send new messages for which the lab has given credit."""
+        """Wait for messages from the lab or the station, and pass them on.
+
+        New messages of the station are sent only as far as the lab has granted credit for them. The wait lasts at most
+        `wait_ms` [ms].
+        """
         now = self._clock()
         poller = zmq.Poller()
         for (line, flow), sent_at in zip(self._flows, self._sent_at, strict=True):

@@ -186,8 +186,12 @@ def unwrap_onto(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) 
 def fade_weights(count: int, shape: str = "linear") -> Float64:
     """Return the weights [count] of the outgoing plan: 1 at the first row, 0 at the last; 0 for a single row.
 
-    Shapes: "linear"; "cosine" (no kink at either end); "exponential": c (e^c - 1) / (e - 1) of the linear weight c, the
-    soft mask of real-time chunking (arXiv 2506.07339, eq. 5), which takes over sooner.
+    The allowed shapes are:
+
+    * "linear": the weight falls evenly.
+    * "cosine": the weight has no kink at either end.
+    * "exponential": the weight is c (e^c - 1) / (e - 1), where c is the linear weight. This is the soft mask of
+      real-time chunking (arXiv 2506.07339, eq. 5). With this shape the new plan takes over sooner.
 
     Raises:
         ValueError: If `shape` is unknown.

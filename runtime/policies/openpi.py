@@ -209,8 +209,9 @@ class OpenpiPolicy(WebsocketPolicy):
 
 
 def _check_protocol(metadata: Mapping[str, Any]) -> None:
-    """Raise WrongProtocolError if the metadata belong to a server that sends metadata first, too, but accepts other
-    requests.
+    """Raise WrongProtocolError if the metadata show that the server speaks another protocol.
+
+    Some other servers send metadata first too, as openpi servers do, but then expect other requests.
     """
     kind = next((kind for mark, kind in _MARKS.items() if mark in metadata), None)
     if kind is not None:

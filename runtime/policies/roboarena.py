@@ -70,10 +70,12 @@ class RoboarenaPolicy(WebsocketPolicy):
         )
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return the chunk; `timing` contains only our `round_trip_ms`, because the protocol has no durations of the
-        server.
+        """Return the chunk.
 
-        Raises PolicyLostError if the server is absent or does not respond: the next call opens another connection.
+        `timing` contains only the `round_trip_ms` that we measure, because the protocol does not carry the durations of
+        the server.
+
+        Raises PolicyLostError if the server is absent or does not respond. The next call then opens another connection.
         """
         if conditioning is not None:
             raise PolicyError("the RoboArena protocol has no real-time chunking; choose another strategy")

@@ -129,7 +129,10 @@ def _orientation(claimed: object, own: str) -> object:
 
 
 def _space(claims: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
-    """Return the space that the server names by action_space, or by action_mode, which some servers use for it."""
+    """Return the action space that the server states in its metadata or answer; None if it states none.
+
+    The space is stated by the key action_space. Some servers state it by action_mode instead.
+    """
     space: Space | None = None
     for key, allowed in (("action_space", [*_SPACES]), ("action_mode", [*_SPACES, *_MODES])):
         claimed = claims.get(key)

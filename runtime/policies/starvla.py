@@ -1,7 +1,9 @@
-"""Policies on StarVLA websocket servers: typed envelopes with a list of views in a declared order.
+"""Policies on StarVLA websocket servers.
 
-Source: starVLA's websocket policy server and its policy wrapper. Frames and arrays are openpi's. The server's process
-ends after a while without requests, so a ping is sent when there is no other traffic.
+A request is an envelope with a type, which carries the camera views as a list in a declared order. Frames and arrays
+are encoded as by openpi. Source: starVLA's websocket policy server and its policy wrapper.
+
+The server's process ends after a while without requests, so a ping is sent when there is no other traffic.
 """
 
 from __future__ import annotations

@@ -119,9 +119,10 @@ def wait_closed(seconds: float) -> None:
 
 
 class WebsocketLink:
-    """Connection that can be opened again until it is aborted. For one thread, except `abort`.
+    """Connection that can be opened again until it is aborted.
 
-    `dial` returns the host and port to connect to, if they differ from those of the url.
+    Only one thread may use it, except that any thread may call `abort`. `dial` returns the host and port to connect to,
+    if they differ from those of the url.
     """
 
     def __init__(

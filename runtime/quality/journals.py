@@ -1,4 +1,4 @@
-"""Source of the checks for our own episodes; rows are read batch by batch."""
+"""Reader of our own recorded episodes for the quality checks; rows are read batch by batch."""
 
 from __future__ import annotations
 

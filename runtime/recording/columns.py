@@ -160,5 +160,8 @@ def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> l
 
 
 def _leading(tick: ExecutedTick) -> int:
-    """Return the chunk with the largest weight, the newest if weights are equal; -1 if there is none."""
+    """Return the id of the chunk with the largest weight in the tick; -1 if no chunk contributed.
+
+    If several chunks have the largest weight, the newest of them counts.
+    """
     return max(zip(tick.weights, tick.chunk_ids, strict=True), default=(0.0, -1))[1]

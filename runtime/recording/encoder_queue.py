@@ -32,7 +32,10 @@ def encode_count(repeats: int) -> int:
 
 
 class Pace:
-    """Present coding time of one frame [s]: an increase counts at once, a decrease over several frames."""
+    """Estimate of the time that it takes at present to encode one frame [s].
+
+    An increase changes the estimate at once, a decrease only over several frames.
+    """
 
     def __init__(self) -> None:
         self.coding_s = _GUESS_S

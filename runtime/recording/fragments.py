@@ -57,7 +57,10 @@ def _part(file: BinaryIO, begin: int, end: int) -> tuple[bytes, int]:
 
 
 def frames_in(data: bytes | bytearray) -> int:
-    """Return the frames of the whole fragments in `data`, from their run boxes (ISO/IEC 14496-12, section 8.8.8)."""
+    """Return the number of frames in the whole fragments of `data`.
+
+    The number comes from the run boxes of the fragments (ISO/IEC 14496-12, section 8.8.8).
+    """
     return _samples(io.BytesIO(data), 0, len(data))
 
 

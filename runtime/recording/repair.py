@@ -74,12 +74,14 @@ class RepairReport:
 def repair(path: Path) -> RepairReport:
     """Complete the episode in folder `path` if it has no outcome; running it again changes nothing.
 
-    An episode that had an outcome gets it back from its copy if its files match. Otherwise, or if it is marked as
-    damaged, it is left alone: changed files are never sealed as if they had been recorded.
+    If the outcome of an episode is lost but was written before, the outcome is restored from its copy, provided that
+    the episode's files match it. If they do not match, or if the episode is marked as damaged, the episode is left
+    alone: changed files are never sealed as if they had been recorded.
 
-    Rows without a frame in every video are cut, except for cameras whose video had ended before; the table as found
-    stays as rows.uncut.arrow. Videos are never re-encoded: only a torn fragment at their end is cut. Raises
-    RecordingError if the disk fails.
+    Rows without a frame in every video are cut. Cameras whose video had ended before do not count for this. The table
+    as found stays as rows.uncut.arrow. Videos are never re-encoded: only a torn fragment at their end is cut.
+
+    Raises RecordingError if the disk fails.
     """
     if not path.is_dir():
         raise RecordingError(f"{path} is no folder of an episode")

@@ -122,7 +122,10 @@ def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
 
 
 def episodes_in(path: Path) -> list[Path]:
-    """Return the episode folders that `path` is, or that are in it or in its folder `episodes`.
+    """Return the folders of the episodes at `path`, which is one of three.
+
+    If `path` is itself the folder of an episode, this folder is returned. Otherwise the episode folders in its
+    subfolder `episodes` are returned, or those in `path` if there is no such subfolder.
 
     Raises RecordingError if there are none.
     """
@@ -193,7 +196,10 @@ def _joined(spans: list[tuple[int, int]], first: int, last: int) -> list[tuple[i
 
 
 def _manifest(folder: Path) -> Mapping[str, object]:
-    """Return the manifest, which is needed only for times; {} if it is unreadable, which its digest reports."""
+    """Return the manifest, which is needed only for times; {} if it is unreadable.
+
+    An unreadable manifest is reported by the comparison with its digest.
+    """
     try:
         return read_json(folder / MANIFEST)
     except RecordingError:

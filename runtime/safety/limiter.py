@@ -25,12 +25,13 @@ class LimitedCommand(NamedTuple):
 
 
 class CommandLimiter:
-    """Limiter of each number to finite values, to its limits, and to its velocity and acceleration limits.
+    """Last limit on every command: each number is made finite and kept within its limits.
 
-    Velocity and acceleration are computed from the last command. The safety filter and all generated motions stay
-    within tighter limits: this check catches their defects. If limits contradict each other, position has priority over
-    velocity, and velocity over acceleration. A joint that is outside its limits may stay there or come back. Binary
-    grippers have no velocity limit. A stop may remove any velocity at once.
+    The limits are those of position, velocity and acceleration. Velocity and acceleration are computed from the last
+    command. The safety filter and all generated motions stay within tighter limits: this check catches their defects.
+    If limits contradict each other, position has priority over velocity, and velocity over acceleration. A joint that
+    is outside its limits may stay there or come back. Binary grippers have no velocity limit. A stop may remove any
+    velocity at once.
     """
 
     def __init__(self, limits: Limits, settings: SafetySettings) -> None:

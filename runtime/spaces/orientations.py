@@ -35,8 +35,9 @@ class Orientation(ABC):
 
     @abstractmethod
     def decode(self, numbers: Float64) -> tuple[Float64, Bools]:
-        """Return unit quaternions, and bool [T, arms]: whether the numbers determine them; if not, they are the
-        identity.
+        """Return unit quaternions, and whether the numbers determine each orientation, bool [T, arms].
+
+        A quaternion is the identity if the numbers do not determine the orientation.
         """
 
 

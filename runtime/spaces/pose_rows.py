@@ -100,8 +100,10 @@ class PoseRows:
         return self.written(self.frame.express(upright, joints), appended, previous)
 
     def written(self, vectors: Float64, appended: Float64, previous: Float64 | None = None) -> Float64:
-        """Return rows for `vectors`, which are in this frame with unit quaternions, and the joints [T, n] that follow
-        them.
+        """Return pose rows from the poses `vectors` and the joints `appended` [T, n] that follow them in each row.
+
+        `vectors` must be in the frame of this format, and have unit quaternions. With `previous` [width] the first row
+        is written close to it; with `previous` [T, width] each row is written close to the corresponding row.
         """
         poses = np.empty((len(vectors), len(self._arms), self._each))
         poses[..., _POSITION] = vectors[..., _POSITION]
@@ -175,7 +177,10 @@ def continuous_quaternions(quaternions: Float64) -> Float64:
 
 
 def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
-    """Return the indices of the appended groups' joints in the robot's vector, in the declared order."""
+    """Return the indices, in the robot's vector, of the joints that follow the poses in a row.
+
+    They are the joints of `pose.groups`, in the declared order. `key` names the deployment's table in error messages.
+    """
     plain_groups = [group.name for group in robot.groups if group.chain is None]
     for place, name in enumerate(pose.groups):
         if name not in plain_groups or name in pose.groups[:place]:
@@ -190,7 +195,11 @@ def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
 
 
 class PosePublisher:
-    """Converter of each sent joint command [D] to a pose row float32 [W] close to the previous row."""
+    """Converter of the joint commands that are sent: each command [D] becomes a pose row float32 [W].
+
+    An orientation can often be written in several ways. The converter chooses the one that is closest to the previous
+    row.
+    """
 
     def __init__(self, rows: PoseRows, end_effectors: EndEffectors) -> None:
         self._rows = rows

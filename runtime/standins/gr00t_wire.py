@@ -17,7 +17,11 @@ class Pickled:
 
 
 def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
-    """Pack one message; arrays as openpi does if `foreign`, as msgpack_numpy does if `modern` (N1.7), else as .npy."""
+    """Pack `value` as one message.
+
+    `modern` and `foreign` select the form of arrays. If `foreign`, arrays have openpi's form. Otherwise they have the
+    form of msgpack_numpy if `modern` (as in N1.7), else the .npy form.
+    """
 
     def written(item: object) -> object:
         if isinstance(item, Pickled):

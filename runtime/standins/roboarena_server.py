@@ -115,9 +115,10 @@ class RoboarenaServer(WebsocketServer):
         return lambda request: self._reply(answer, request)
 
     def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
-        """Send the error to the client; return False if the connection is then closed.
+        """Send the error to the client; return False if the connection is closed afterwards.
 
-        vLLM-Omni sends a short binary message and keeps the connection open.
+        A server of vLLM-Omni sends a short binary message and keeps the connection open; this stand-in does the same in
+        that variant.
         """
         if self._arena.variant == "roboarena":
             return super().failed(connection, error, request)

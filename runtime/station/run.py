@@ -126,7 +126,10 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Entries of every manifest about the station; `spec` is that of the last set-up."""
+    """Entries about the station that every manifest has.
+
+    `spec` is the specification of the last set-up.
+    """
 
     spec: StationSpec
     boot: str

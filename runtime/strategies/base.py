@@ -54,7 +54,7 @@ class StrategyParameters(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """State on which a `Query` decides."""
+    """State from which a `Query` decides whether to send a request."""
 
     remaining: int  # steps still planned
     in_flight: bool  # a request is pending, or its chunk is not merged yet
@@ -209,8 +209,8 @@ def _fade(
 ) -> None:
     """Start a fade in which the next plan takes over from `rows` within `count` steps.
 
-    If there are fewer rows than steps, the last row is held. `makers` are the contributions of the first rows; further
-    rows are held targets.
+    If there are fewer rows than steps, the last row is held. `makers` are the contributions of the first rows. Rows
+    beyond them are held targets, and their contribution is HELD.
     """
     last = np.minimum(np.arange(count), len(rows) - 1)
     contributions = [*makers[:count], *single_contribution(HELD, max(0, count - len(makers)))]

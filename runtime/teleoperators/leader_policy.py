@@ -150,7 +150,10 @@ class LeaderPolicy(Policy):
         self._last = None
 
     def resume(self) -> None:
-        """Forget the engagement, because the robot was held or there were no observations."""
+        """Begin a new engagement of the leader at the next request.
+
+        This is needed because the robot was held, or because there were no observations.
+        """
         self.reset()
 
     def close(self) -> None:

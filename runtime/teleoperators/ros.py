@@ -98,8 +98,9 @@ class RosLeader(Leader):
 
     @property
     def problem(self) -> str:
-        """Reason why a message could not be used, else a sentence on each topic without new messages; "" if all have
-        some.
+        """Reason why a message could not be used, else a sentence on each topic that has no new messages.
+
+        It is "" if there are new messages on all topics.
         """
         if problem := super().problem:
             return problem

@@ -120,9 +120,10 @@ _BACKWARDS_S = 0.1  # [s]; one socket keeps the order, so an earlier stamp means
 class NodeSource(Source):
     """SUB socket that a thread empties continuously, so that no frame ages in a queue.
 
-    The newest frame is the one that arrived last: after a restart a node's clock is smaller, and its frames count at
-    once. `Observation.sequence` counts the usable frames since `connect`, independent of the node's own numbers. Errors
-    in the thread are counted; if the socket fails, the thread opens another.
+    The newest frame is the one that arrived last, whatever time the node stamped on it. After a restart a node may
+    stamp smaller times than before, and its frames are nevertheless used at once. `Observation.sequence` counts the
+    usable frames since `connect`, independent of the node's own numbers. Errors in the thread are counted; if the
+    socket fails, the thread opens another.
     """
 
     _told: str  # last reported reason why no frame arrives
@@ -313,8 +314,10 @@ class NodeSource(Source):
             self._count_fault("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, time: float) -> dict[str, float]:
-        """Return the capture time by stream: `time`, but for an unchanged picture the time at which it first
-        appeared.
+        """Return the capture time of each stream [s].
+
+        It is `time`, except for a picture that has not changed: the capture time of such a picture is the time at which
+        the picture first appeared.
         """
         times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
         if self._detect_frozen:

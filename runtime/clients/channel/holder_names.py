@@ -11,10 +11,13 @@ _CONNECTIONS = 1000  # connections remembered
 
 
 class HolderNames:
-    """Assignment of messages to lease holders: a script that names itself, a connection, or all scripts together.
+    """Assignment of each message to the lease holder that sent it.
 
-    `user` is the name of the channel itself, with its operator. A holder's name is `user`, followed by the name that
-    the script gives itself, which is not verified.
+    A script that names itself is a holder of its own. For scripts without a name there are two settings: each
+    connection is a holder, or all of these scripts together are one holder.
+
+    `user` is the name of the channel itself, with its operator. The name of a holder begins with `user`. It is followed
+    by the name that the script gives itself, which is not verified, or by the number of the connection.
     """
 
     def __init__(self, operator: str, scripts: Literal["apart", "together"]) -> None:

@@ -139,9 +139,10 @@ def _client(fields: Mapping[str, Any]) -> str:
 
 
 def _identity(fields: Mapping[str, Any]) -> str:
-    """Return the uuid under which a repeated command gets its first answer.
+    """Return the id of the message, a UUID; "" if it has none.
 
-    A plain name does not count, because two scripts could use it by accident.
+    A command that is repeated under the same id gets the answer to its first execution. Other names are refused as ids,
+    because two scripts could use the same name by accident.
     """
     value = fields.get("id", "")
     if value == "":

@@ -1,4 +1,7 @@
-"""Outcomes of commands that continue after they were accepted; these are polled until they are over."""
+"""Outcomes of commands that continue after they were accepted.
+
+The station is polled for the outcome of such a command until the command has ended.
+"""
 
 from __future__ import annotations
 

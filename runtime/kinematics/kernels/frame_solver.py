@@ -134,10 +134,10 @@ def _evaluate(costs: Costs, frame: Record) -> float:
 
 @device_function
 def _set_quadratic(rest: float, frame: Record) -> None:
-    """Set the quadratic problem for the next step from frame.q: gradient and system of half the cost, and the box.
+    """Set the quadratic problem for the next step, which starts from frame.q.
 
-    `rest` is the weight of the distance from the rest position. The box is the range of steps that stay within the
-    bounds.
+    The problem consists of the gradient of half the cost, the matrix of its linear system, and the box. The box is the
+    range of steps that stay within the bounds. `rest` is the weight of the distance from the rest position.
     """
     box, jacobian = frame.box, frame.jacobian
     for i in range(len(frame.q)):

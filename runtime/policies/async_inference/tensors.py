@@ -39,8 +39,8 @@ Array = np.ndarray[Any, Any]
 class Tensors:
     """Tensors of one message.
 
-    Storages are cached by their bytes, because a server sends the same storage with each row. `reader` is a class of
-    pickle interpreters for plain data.
+    Storages are cached by their bytes, because a server sends the same storage with each row. `reader` is the class of
+    the pickle interpreter for plain data; the interpreter for storages is derived from it.
     """
 
     def __init__(self, reader: type[Any]) -> None:

@@ -31,9 +31,10 @@ _WATCHED = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED | zmq.EVENT_DISCONNECTED
 
 
 class ReqLink:
-    """REQ socket for one thread at a time, except `abort`; messages of more than `limit` bytes end the connection.
+    """REQ socket that can be used by one thread at a time, except that any thread may call `abort`.
 
-    `dial` returns the host and port to connect to, if they differ from those of the url.
+    Messages of more than `limit` bytes end the connection. `dial` returns the host and port to connect to, if they
+    differ from those of the url.
     """
 
     def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:

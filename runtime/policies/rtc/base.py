@@ -63,9 +63,11 @@ class NoRtc(Dialect):
 
 
 def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
-    """Return the map under the metadata key `rtc`, which our bundled server has; None without the key.
+    """Return the value of the metadata key `rtc`, a map that declares the dialect; None if there is no such key.
 
-    Raises PolicyError if the server accepts only versioned envelopes, or if the value is not such a map.
+    Our bundled server has this key. `name` is the configured dialect.
+
+    Raises PolicyError if the server accepts only versioned envelopes, or if the value is not a map with a dialect.
     """
     refuse_envelopes(metadata, name)
     declared = metadata.get("rtc")

@@ -56,8 +56,10 @@ class Kai0(Dialect):
         return reply
 
     def _continued(self, conditioning: Conditioning | None) -> tuple[Message, int, int]:
-        """Return the key with the previous chunk, the delay, and the first row that does not follow the previous
-        chunk.
+        """Return the map that carries the previous chunk, the delay, and the first row that is free.
+
+        The map has a single key, or none without conditioning. The free rows are those that do not have to follow the
+        previous chunk.
         """
         if conditioning is None:
             return {}, 0, 1

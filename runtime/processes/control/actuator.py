@@ -61,9 +61,10 @@ class TickSettings:
 
 
 class TickResult(NamedTuple):
-    """Result of one tick: `target` is the target of the behaviour, `executed` float64 [D] the action that was sent.
+    """Result of one tick.
 
-    `target` is None if the behaviour had none, `executed` if nothing was sent.
+    `target` is the target of the behaviour; it is None if the behaviour had none. `executed` float64 [D] is the action
+    that was sent; it is None if nothing was sent.
     """
 
     time: float  # our monotonic clock [s]
@@ -159,7 +160,10 @@ class Actuator(ABC):
         return np.asarray(self.velocity**2 / (2.0 * safety.brake_acceleration * limits.radian_scale))
 
     def elapsed(self, planned: float) -> float:
-        """Return the time since the last tick for use in limits, clipped to 0.5 to 1.5 periods [s]."""
+        """Return the time since the last tick [s], clipped to 0.5 to 1.5 periods, for use in limits.
+
+        `planned` is the planned time of the present tick [s].
+        """
         period = self._settings.period
         since = period if self._last_planned is None else planned - self._last_planned
         return min(max(since, period * 0.5), 1.5 * period)

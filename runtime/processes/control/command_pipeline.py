@@ -62,7 +62,9 @@ class _Gap:
 
 
 class CommandPipeline:
-    """Sequence behaviour, target, gripper locks, safety, actuator, executed once per tick for one robot.
+    """Pipeline of commands for one robot, executed once per tick.
+
+    Its parts are, in this order: behaviour, target, gripper locks, safety, actuator.
 
     A refused action is replaced by the next point of a braking motion, so that a command is sent on every tick. After
     too many refusals, or when actions are missing for too long, the pipeline holds. If actions are refused only because
@@ -151,8 +153,8 @@ class CommandPipeline:
     def move(self, goal: Float64, speed: float) -> None:
         """Brake, then move to `goal` [D] at `speed`, a share of the speed of generated motions.
 
-        Dimensions that are NaN stay where they stop, and speeds end at 0. Binary grippers end open or closed, and
-        switch at the beginning.
+        A dimension for which `goal` is NaN stays where braking has stopped it. Dimensions that are speeds end at 0.
+        Binary grippers end open or closed, and switch at the beginning of the motion.
         """
         self._begin()
         self._start_motion(snap_grippers(self._settings.switches, goal, self.actuator.commanded), speed)
@@ -355,7 +357,11 @@ class CommandPipeline:
             self._go_on(run, planned - self._unseen_since)
 
     def _may_wait(self, planned: float) -> bool:
-        """Return True if a run may wait for its joints: their gap is short, and gaps are not too frequent."""
+        """Return True if the run may wait for joints that are missing.
+
+        This is the case while the present gap in the joints is short, and gaps have not been too frequent. `planned` is
+        the planned time of the tick [s].
+        """
         often = len(self._gaps) == _GAPS and planned - self._gaps[0] < _GAPS_S
         return not often and planned - self._unseen_since < self._settings.safety.joint_gap_s
 

@@ -234,8 +234,8 @@ class DisplacementMonitor:
     def _finish(self, robot: RobotActuator) -> None:
         """End the convergence, and decide for each joint whether its command may follow its reading again later.
 
-        It may if the joint was proven to move independently of the command. If a convergence ends without proof for a
-        joint, it may as well, but only until _VERDICTS convergences have ended so.
+        The command may follow if the joint was proven to move independently of the command. Without proof for a joint,
+        the command may follow too, but only until _VERDICTS convergences have ended without proof.
         """
         assert self._led is not None
         verdict = np.where(self._blind, 1, self._led.verdict)

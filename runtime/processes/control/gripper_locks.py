@@ -31,9 +31,10 @@ class GripperLocks:
         self.on = np.zeros(len(limits.lower), bool)  # [D]
 
     def set(self, values: Float64, commanded: Float64) -> str:
-        """Lock grippers at `values` [D] within their limits, NaN: unlock; return the reason if refused, else "".
+        """Lock grippers at `values` [D] within their limits; NaN unlocks a gripper.
 
-        Binary grippers are locked open or closed, with hysteresis around `commanded` [D].
+        Return the reason if the locks are refused, else "". Binary grippers are locked open or closed, with hysteresis
+        around `commanded` [D].
         """
         limits = self._limits
         if values.shape != limits.lower.shape or values.dtype.kind != "f":

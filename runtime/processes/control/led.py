@@ -43,9 +43,11 @@ class Led:
             measured: Readings at the start [D].
             speed: Velocity of the readings at the start [D].
             now: Present time [s].
-            at_once: Joints that converge without parts and rests, bool [D]. During a rest, the command would pull back
-                an arm whose drive is switched on again, and a blocked arm would continue to press.
-            along: Number of parts of earlier convergences in which the readings moved with the command, int [D].
+            at_once: True for joints that converge in one motion, bool [D]; the others converge in parts with a rest
+                after each. During a rest, the command would pull back an arm whose drive is switched on again, and a
+                blocked arm would continue to press.
+            along: Number of parts in earlier convergences in which the readings of a joint moved with the command, int
+                [D].
         """
         self.at_once = np.broadcast_to(np.asarray(at_once, bool), commanded.shape)
         self.along: np.ndarray = np.zeros(len(commanded), np.int64) + along

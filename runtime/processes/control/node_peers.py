@@ -38,7 +38,10 @@ class NodeHandover:
         return self._left > 0
 
     def update(self, yielded: bool, now: float) -> None:
-        """Update at each tick `now` [s]: `yielded` is whether the robot is node-driven."""
+        """Send what is due at this tick; call it at every tick.
+
+        `yielded` is True while the robot is yielded to its node. `now` is the time of the tick [s].
+        """
         if yielded is not self._yielded:
             self._yielded = yielded
             self._word, self._left = (BEGIN if yielded else END), _TIMES

@@ -184,7 +184,11 @@ class JointPlausibility:
         return np.asarray(np.median(lately, axis=0))
 
     def speed(self) -> Float64:
-        """Return the median velocity [D] between the newest trusted samples; a single step does not count."""
+        """Return the median velocity [D] between the newest trusted samples.
+
+        The samples are those that span the last CONSISTENT_S seconds; the velocity is 0 while there are too few of
+        them. Because of the median, a single step of a reading does not change the result.
+        """
         lately = [] if self._chain is None else self._chain.recent(CONSISTENT_S)
         steps = [
             difference(after.joints, before.joints, self._wrapping)
@@ -278,7 +282,7 @@ class JointPlausibility:
         return self._places & (moved > allowed)
 
     def _jump(self, sample: _Sample) -> str:
-        """Describe the contradiction of a sample to the trusted ones."""
+        """Return a message about how `sample` contradicts the trusted samples."""
         if self._chain is None:
             return _NOT_SEEN_LONG_ENOUGH(seconds=CONSISTENT_S)
         before = self._chain.newest

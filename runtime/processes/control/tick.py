@@ -142,7 +142,7 @@ class Tick:
 
     @property
     def is_handing_over(self) -> bool:
-        """Whether the node must still be sent a repetition of the word that begins or ends its driving."""
+        """Whether the control word that begins or ends the node's driving must still be repeated to the node."""
         return self._yielding.is_repeating
 
     @property
@@ -433,7 +433,7 @@ class Tick:
         return self._actuator.commanded if self._robot.behaviour.moving and self._actuator.engaged else None
 
     def _check_plausibility(self, now: float) -> None:
-        """Hold while measurements are implausible, and emit which joint is."""
+        """Hold the robot while the measured joints are implausible, and emit the reason."""
         doubt = self._seen.implausible_reason
         if (
             not doubt or not self._plausibility.has_known_sample

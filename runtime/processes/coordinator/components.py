@@ -1,4 +1,4 @@
-"""Components of the coordinator, for those of its modules that use many of them."""
+"""All components of the coordinator in one object, for those modules of the coordinator that use many of them."""
 
 from __future__ import annotations
 

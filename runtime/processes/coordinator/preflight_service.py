@@ -117,9 +117,10 @@ class PreflightService:
         return self._preflights.report(read("preflight_report", PreflightReportRequest, command.args).id)
 
     def _server(self, command: Command) -> dict[str, Any]:
-        """Return the address of a policy's server, and the session's state.
+        """Return the data of the answer to a query for a policy server: its address, and the state of the session.
 
-        The policy is the one in the query if it has one, otherwise the one in force.
+        If the query has a `policy`, the server is the one of that policy. Otherwise it is the server of the policy in
+        force.
         """
         request = read("policy_server", PolicyServerRequest, command.args)
         settings = self._in_force().deployment

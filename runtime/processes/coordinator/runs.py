@@ -285,7 +285,7 @@ class Runs:
             self._start_after_arrival(self.open)
 
     def approach(self, goal: Float64) -> None:
-        """Move to `goal` [D], the start of the proposal."""
+        """Move the robot to `goal` [D], the joints at which the proposed chunk starts."""
         if self.open is not None:
             self.open.approach()
             self.move(goal, 1.0)
@@ -374,7 +374,10 @@ class Runs:
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
     def record_event(self, message: Message) -> None:
-        """Send a message for the record; if media does not read, it is lost and that is logged."""
+        """Send a message to media for the record.
+
+        If media does not read the message, the message is lost, and the loss is logged.
+        """
         try:
             self._send(message)
         except RuntimeFault as error:

@@ -12,9 +12,10 @@ _KEPT = 256  # most entries of either half that wait for the other
 
 
 class ChunkLog:
-    """Writer of each chunk of one episode, when the policy's response and its placement are both known.
+    """Writer of the chunks of one episode.
 
-    They may come in either order. Methods raise RecordingError.
+    A chunk is written when both the policy's response and the placement by control are known. The two may come in
+    either order. The methods raise RecordingError.
     """
 
     def __init__(self, journal: Journal) -> None:

@@ -257,9 +257,9 @@ class Media:
         return EpisodeOpened(run, identity, str(path))
 
     def _run_begun(self, message: RunBegun) -> None:
-        """Report to the coordinator that the episode is open.
+        """Report to the coordinator that the episode is open, now that the source's run has begun.
 
-        The source's run has begun, and its first frame is in the run's first tick.
+        The report waits for this so that the first frame of the source's run is in the first tick of the run.
         """
         opened = self._opened
         if opened is not None and message == RunBegun(opened.run, self._generation):

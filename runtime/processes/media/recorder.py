@@ -189,7 +189,10 @@ class Recorder:
     # --- input ---------------------------------------------------------------------------------------------
 
     def add_observation(self, observation: Observation) -> None:
-        """Add an observation from reception, before the record of a tick that used it."""
+        """Add an observation from reception.
+
+        The caller must add it before the record of a tick that used the observation.
+        """
         self._seen.append(observation)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
@@ -208,7 +211,10 @@ class Recorder:
             self._chunks.add_merge(merged)
 
     def add_tick(self, tick: ExecutedTick) -> None:
-        """Record one control tick at the full control rate, and write every grid row that is complete with it."""
+        """Record one control tick, and write the rows of the dataset grid that are complete with this tick.
+
+        Ticks are recorded at the full control rate.
+        """
         if not self._uuid or self._complete or (self._run and tick.run != self._run):
             return
         if self._schema.reported:

@@ -14,7 +14,7 @@ Close = Callable[[], ClosedEpisode]
 
 
 def at_once(close: Close) -> Future[ClosedEpisode]:
-    """Close an episode immediately, as lockstep does."""
+    """Close an episode immediately in this thread, as a lockstep station does; the result is known at once."""
     future: Future[ClosedEpisode] = Future()
     future.set_result(close())
     return future
@@ -79,9 +79,9 @@ class UnclosedEpisodes:
         return None
 
     def finish(self, seconds: float) -> ClosedEpisode | None:
-        """Try once more, waiting at most `seconds` [s]; return the episode that is closed now, or None.
+        """Try once more to close an episode, waiting at most `seconds` [s].
 
-        Repair completes the remaining episodes later.
+        Return the episode that is closed now, or None. Repair completes the remaining episodes later.
         """
         self._back_off.reset()
         closed = self.poll()

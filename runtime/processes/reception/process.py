@@ -154,11 +154,12 @@ class Reception:
 def make_source(
     spec: StationSpec, clock: Clock, build: Callable[[Any, Robot, Clock], Source] | None = None
 ) -> Source:
-    """Create the source, not yet connected: the transport's, with the deployment's own cameras added.
+    """Create the source of observations, not yet connected.
 
-    The transport must not wait for pictures of cameras that the deployment opens itself. It therefore gets a
-    description of the robot without these cameras; only cameras that the transport does not deliver in any case remain
-    in it. `build` replaces the constructor of the transport's kind.
+    It is the transport's source, with the deployment's own cameras added. The transport must not wait for pictures of
+    cameras that the deployment opens itself. Therefore the transport gets a description of the robot without those of
+    these cameras that it would otherwise deliver. Cameras that the transport does not deliver anyway remain in the
+    description. `build` replaces the constructor of the transport's kind.
     """
     settings = spec.deployment
     own = settings.cameras.keys() & set(delivered_cameras(settings, spec.robot))

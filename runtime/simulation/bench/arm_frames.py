@@ -56,8 +56,9 @@ class ArmFrames:
         return np.asarray(self.frame(q) @ self.arm.transform(q))
 
     def tip(self, q: Float64) -> Float64:
-        """Return the pose of the fingertips (z ahead, y the opening direction), without fingers that of the
-        end-effector link.
+        """Return the pose of the fingertips: z ahead, y the opening direction.
+
+        For an arm without fingers, return the pose of the end-effector link.
         """
         return self.eef(q) if self.arm.tip is None else np.asarray(self.eef(q) @ self.arm.tip)
 

@@ -33,11 +33,11 @@ class BenchError(RuntimeFault):
 
 @dataclass(frozen=True, slots=True)
 class Belt:
-    """Belt along x: its place, and the place of fingertips relative to a block that rides on it [m].
+    """Belt along x: its place, and the place of the fingertips relative to a block that rides on it [m].
 
-    The block's centre rides between both ends of `x` at `y`. `fingertip_offset` is from the centre of the block's
-    bottom face to the place of the fingertips: nearer to the arms, so that no arm hides the block from the overhead
-    camera, and clear of the block.
+    The centre of the block rides between the two ends of `x`, at `y`. `fingertip_offset` leads from the centre of the
+    block's bottom face to the place of the fingertips. This place is nearer to the arms than the block, so that no arm
+    hides the block from the overhead camera, and it is so far away that the fingertips do not touch the block.
     """
 
     x: tuple[float, float] = (-0.10, 0.30)

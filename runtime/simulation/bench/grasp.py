@@ -25,10 +25,13 @@ _YIELD = 0.3  # [m/s] speed at which a block yields to a finger that presses fro
 
 
 def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
-    """Move a block that is between closing jaws; return the opening [m] at which it stops them, None if it does not.
+    """Move a block that is between closing jaws.
 
-    `before` is the hand one step ago: a block is between the jaws only if they were open wide enough for it. The jaws
-    shift the block and rotate it into alignment; it is attached to the arm if they hold it from above.
+    Return the opening [m] at which the block stops the jaws; None if the block does not stop them.
+
+    `before` is the hand one step ago. The block counts as between the jaws only if the jaws were wide enough for it
+    then. The jaws shift the block and rotate it into alignment. If they hold it from above, the block is attached to
+    the arm.
     """
     place = hand.tip[:3, :3].T @ (block.pose[:3, 3] - hand.tip[:3, 3])
     if before.opening < _width(block, _turn(hand, block)) - _SLACK or not _between(hand, block, place):

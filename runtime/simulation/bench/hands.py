@@ -21,9 +21,11 @@ _UNMEASURED_JAWS = 0.1  # [m] opening of grippers that do not declare it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hand:
-    """Fingers of an arm at one moment: `tip` [4, 4] in the world (z ahead, y the direction in which they open).
+    """Fingers of an arm at one moment.
 
-    `opening` [m] is the distance between them, `speed` [m/s] that of the tip over the table.
+    `tip` [4, 4] is the pose of the fingertips in the world: z ahead, y the direction in which the fingers open.
+    `opening` [m] is the distance between the fingers. `speed` [m/s] is the speed at which the fingertips move over the
+    table.
     """
 
     arm: str

@@ -135,7 +135,10 @@ class Tabletop:
         self._note()
 
     def _handle(self, jaws: Jaws, q: Float64, seconds: float) -> None:
-        """Apply one arm's fingers to all blocks in this step of `seconds`; a block between its jaws stops them."""
+        """Apply the fingers of one arm to all blocks in this step, which lasts `seconds`.
+
+        A block between the jaws stops the jaws. `q` [D] are the joints of the robot.
+        """
         before = self._hands.get(jaws.name)
         hand = jaws.hand(q, before, seconds)
         stops = [

@@ -60,9 +60,11 @@ class Skill:
     """Deliberate imperfection of the policy.
 
     `noise` [m] is the standard deviation of the error of the block's place in x and in y, drawn for each attempt. The
-    yaw has an error as well: with noise of one block edge its standard deviation is one radian. `failure_rate` is the
-    probability that in an episode the policy drops the block on the way or always grasps short of it; `seed` decides
-    both, episode by episode.
+    yaw has an error as well, whose standard deviation grows with `noise`: it is one radian if `noise` is the edge of a
+    block.
+
+    `failure_rate` is the probability that an episode fails. In an episode that fails, the policy either drops the block
+    on the way or always grasps short of it. `seed` decides the errors and the failures, episode by episode.
     """
 
     noise: float = 0.0
@@ -197,9 +199,10 @@ class PickPlaceEpisode:
         self._follow_route(None)
 
     def _is_over(self, pause: float) -> bool:
-        """Return True if the episode ended before a pause in the requests of `pause` [s].
+        """Return True if the episode ended before a pause of `pause` [s] in the requests.
 
-        That is so if the pause is long, and before it there was no route or the arm was already leaving the plate.
+        The episode has ended if the pause is long and one of two conditions held before the pause: there was no route,
+        or the arm was already leaving the plate.
         """
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED

@@ -213,9 +213,10 @@ class RoutePlanner:
         )
 
     def _timed(self, stations: Float64, shortest: float) -> Float64:
-        """Return rows [n, D] on a polynomial through stations [k, D] with minimum-jerk timing, at rest at both ends.
+        """Return rows [n, D] of a motion through the joints `stations` [k, D], at rest at both ends.
 
-        They last at least `shortest` [s].
+        The path is a polynomial through the stations, with minimum-jerk timing. The motion lasts at least `shortest`
+        [s].
         """
         marks = np.linspace(0.0, 1.0, len(stations))
         powers = np.linalg.solve(np.vander(marks, increasing=True), stations)

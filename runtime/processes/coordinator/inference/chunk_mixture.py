@@ -53,7 +53,11 @@ class Mixture:
         return _mixed(parts, self._dims.switched, self._dims.wrapping)
 
     def numbers(self, parts: MixtureParts, like: ActionChunk) -> Float64:
-        """Mix rows [N, W] linearly, for example in model space; `like` is a chunk with the same columns."""
+        """Mix the rows in `parts` linearly, and return the mixed rows [N, W].
+
+        The rows may be of any kind that can be mixed linearly, for example rows in model space. `like` is a chunk with
+        the same columns; it tells which columns are binary grippers.
+        """
         return _mixed(parts, self._switched(like), ())
 
     def poses(self, joints: Float64, newest: Float64, like: ActionChunk) -> Float64:

@@ -25,7 +25,10 @@ class StaleObservationError(PolicyError):
 
 
 class ObservationProvider(Protocol):
-    """Source of a policy's observations; `simulated`: they contain the joints of the simulated robot."""
+    """Source of a policy's observations.
+
+    `simulated` is True if the observations contain the joints of the simulated robot instead of the real one.
+    """
 
     @property
     def simulated(self) -> bool: ...

@@ -242,10 +242,11 @@ class PolicyRequests:
     def _chunk_start(
         self, observation: Observation, waited: bool, rests: bool, k_max: int | None
     ) -> ChunkStart:
-        """Return where the chunk will take over: the present command, and the first row that can be executed.
+        """Return where the chunk takes over: the present command, and the first row that can still be executed.
 
-        This row is the one after the newest control step; with `waited` it is row 0. If the robot `rests`, the chunk
-        starts from the measured joints.
+        This row is the one after the newest control step, but at most row `k_max` if `k_max` is given. If the robot
+        `waited` for the chunk, it is row 0. If the robot `rests`, the chunk starts from the measured joints instead of
+        the command.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         newest = self.policy_observation.commanded()
@@ -261,9 +262,10 @@ class PolicyRequests:
         """Return the rows up to the first refused pose, and the reason; all rows and "" if no pose is refused.
 
         Poses before row `first` are not checked, because they will not be executed. A pose is refused if it is out of
-        reach, or if the joints would lag behind it by more than a jump. A smaller lag is permitted, because the safety
-        filter also limits joint rows. If `begins` and row `first` itself is refused for its lag, that row is kept, so
-        that control reports the distance.
+        reach, or if the joints would lag behind it by more than the permitted jump. A smaller lag is permitted, because
+        the safety filter also limits joint rows. If `begins`, which means that the request is the first after a reset
+        or a hold, and row `first` itself is refused for its lag, this row is kept. Control then reports the distance to
+        it.
 
         Raises:
             PolicyError: no row remains.
@@ -292,7 +294,10 @@ class PolicyRequests:
         return cut, _ROWS_REFUSED(wrong=wrong, kept=usable - first)
 
     def _refused(self, commands: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
-        """Return the reason why row `row` is refused, "" if it is not, and True if its pose is within reach."""
+        """Return the reason why row `row` is refused, and whether the pose of this row is within reach.
+
+        The reason is "" if the row is not refused.
+        """
         free, distance = self._spaces.meet(commands, row)
         over = bound.misses(free)[0]
         if over.any():

@@ -206,11 +206,11 @@ class RtcPrefix:
     def _planned(
         self, committed: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
-        """Return the rows of `committed`, with the planned rows in place of its own at `steps`.
+        """Return the rows of the chunk `committed`, where the rows at `steps` are replaced by the rows of the plan.
 
-        None if the plan is unknown. `passed` is the row nearest to the first step. Rows that are not absolute cannot be
-        mixed themselves. Instead, their joints are mixed, and the result is converted to rows relative to
-        `observation`.
+        Return None if the plan is unknown. `passed` is the row of the chunk nearest to the first step. Rows that are
+        not absolute cannot be mixed with each other. In this case joints are mixed, and the result is converted to rows
+        relative to `observation`.
         """
         contributions = [self._contributions_at(at) for at in steps.tolist()]
         if committed.chunk.mode != "absolute":
@@ -313,9 +313,10 @@ class RtcPrefix:
         contributions: Sequence[Shares],
         table: Callable[[_CommittedChunk], tuple[Numbers, float]],
     ) -> MixtureParts:
-        """Return the components from which the rows for these steps are mixed, by the weights `contributions`.
+        """Return the components from which the rows for `steps` are mixed.
 
-        `table` returns for a chunk the rows to use, and their number per control step.
+        `contributions` has the weights of the chunks at each of these steps. `table` returns two values for a chunk:
+        the rows to use, and the number of these rows per control step.
         """
         numbers: list[Numbers] = []
         weights: list[Float64] = []

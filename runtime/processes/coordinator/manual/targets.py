@@ -95,9 +95,10 @@ class Targets:
         return self.check_motion("move", goal, commanded)
 
     def check_motion(self, what: str, goal: Float64, commanded: Float64) -> Float64:
-        """Return `goal` [D] with speeds 0, if limits, workspace boxes and collisions permit the path to it.
+        """Return `goal` [D] if limits, workspace boxes and collisions permit the path from `commanded` [D] to it.
 
-        Generated motions end at rest, hence the speeds. `what` begins the message of an error.
+        Dimensions of the goal that are speeds are set to 0, because generated motions end at rest. `what` begins the
+        message of an error.
 
         Raises:
             RuntimeFault: the goal or the path is not allowed.

@@ -147,7 +147,10 @@ class Rule:
     stays: Callable[[Any], bool] = lambda asked: False  # whether the state is unchanged, by the arguments
 
     def next(self, state: SessionState, asked: Any = None) -> SessionState | None:
-        """Return the state after the command, None if unchanged; `asked` are its arguments."""
+        """Return the state after the command; None if the command leaves the state unchanged.
+
+        `state` is the state before the command, and `asked` are the arguments of the command.
+        """
         if self.stays(asked):
             return None
         return self.after.get(state) if isinstance(self.after, Mapping) else self.after
