@@ -198,14 +198,14 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
 
 
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
-    """Kill the recording processes 30 times in turn, and the worker 10 times; 150 and 50 times if `long`.
+    """Kill each of the four recording processes and the worker 10 times; 50 times if `long`.
 
     On a slow machine there are fewer kills, but together at least 10 of them. If `long`, all are made.
     """
     recording, working = (
-        (KillCount(150, 150, 0.0), KillCount(50, 50, 0.0))
+        (KillCount(200, 200, 0.0), KillCount(50, 50, 0.0))
         if long
-        else (KillCount(30, _LEAST_KILLS[0], _KILLED_S[0]), KillCount(10, _LEAST_KILLS[1], _KILLED_S[1]))
+        else (KillCount(40, _LEAST_KILLS[0], _KILLED_S[0]), KillCount(10, _LEAST_KILLS[1], _KILLED_S[1]))
     )
     lab = recording_station.PatientLab(_made(folder / "kills"))
     try:
