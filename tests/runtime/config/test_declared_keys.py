@@ -30,19 +30,19 @@ ELSEWHERE = {
     ),  # offered on pages
     "runtime.config.schema.GripperSettings": (
         "runtime/station/spec.py",
-        "robots.GripperChoice(**given.model_dump())",
+        "robots.GripperChoice(**choice.model_dump())",
     ),
     "runtime.config.collection.CollectionSettings.streams": (
         "runtime/recording/schema.py",
-        'said["streams"]',
+        'collection["streams"]',
     ),
     "runtime.config.collection.CollectionSettings.columns": (
         "runtime/recording/schema.py",
-        'said["columns"]',
+        'collection["columns"]',
     ),
     "runtime.config.collection.CollectionSettings.max_skew_s": (
         "runtime/recording/schema.py",
-        'said.get("max_skew_s")',
+        'collection.get("max_skew_s")',
     ),
     # Read by a process that reads no deployment, of what the supervisor has resolved.
     "runtime.config.schema.PanelSettings": ("runtime/clients/panel/settings.py", '["panel"]'),
