@@ -395,10 +395,11 @@ def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, 
 
 
 def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability of stopping for each course of rates: float64 [courses].
+    """Return the probability that a comparison stops, for each course of success rates: float64 [courses].
 
-    `rates` [courses, pairs] are the common success rates at each pair. With a margin, the second checkpoint's rate is
-    (1 - margin) times the given one, and the first checkpoint's rate is larger than that by the margin.
+    `rates` [courses, pairs] is the success rate that both checkpoints have at each pair of trials. If the design has a
+    margin, the second checkpoint's rate is (1 - margin) times the given rate, and the first checkpoint's rate is the
+    second's plus the margin.
     """
     margin = exact.margin or 0.0
     pairs = exact.looks[-1].first

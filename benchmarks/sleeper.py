@@ -25,7 +25,11 @@ def main() -> None:
 
 
 def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep repeatedly for the rest of the period since the last wake-up; return the wake-ups."""
+    """Sleep repeatedly, each time for the rest of the period since the last wake-up.
+
+    Returns:
+        Times of the wake-ups [s], numbers of the wake-ups, and no lateness, because there are no deadlines.
+    """
     woke = [time.monotonic()]
     end = woke[0] + seconds
     while woke[-1] < end:
@@ -36,7 +40,11 @@ def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[
 
 
 def _deadlines(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep repeatedly until start + n * period; missed deadlines are skipped. Return the wake-ups."""
+    """Sleep repeatedly until start + n * period; missed deadlines are skipped.
+
+    Returns:
+        Times of the wake-ups [s], numbers n of their deadlines, and lateness of the wake-ups [s].
+    """
     clock = MonotonicClock()
     woke: list[float] = []
     steps: list[int] = []

@@ -90,7 +90,10 @@ class Clearance:
         self._select_pairs(*self._telling(robot))
 
     def distances(self, q: Float64) -> Float64:
-        """Return the distances of the pairs [m], [..., K], for the robot's vector [..., D]; negative for overlap."""
+        """Return the distance [m] between the capsules of each of the K checked pairs, as [..., K].
+
+        `q` [..., D] are values of the robot's vector. A distance is negative if the capsules overlap.
+        """
         if q.ndim == 1:
             return self._distances(q)
         flat = q.reshape(-1, q.shape[-1])

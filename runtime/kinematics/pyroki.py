@@ -1,7 +1,7 @@
-"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), which solves the same problem in JAX, for its users.
+"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), for users of PyRoki.
 
-PyRoki is on no package index: install it and jaxls from their repositories. They are imported only if a deployment
-selects this kind.
+It solves the same problem as the default backend, but in JAX. PyRoki is on no package index: install it and jaxls from
+their repositories. They are imported only if a deployment selects this kind.
 """
 
 from __future__ import annotations

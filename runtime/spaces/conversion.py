@@ -293,8 +293,9 @@ class ActionSpaces(EndEffectors):
         return ChunkStart(on_branch(onset.commanded), on_branch(onset.previous_command), onset.first_row)
 
     def _unwrapped(self, rows: Float64, qpos: Float64, dims: NDArray[np.intp]) -> Float64:
-        """Return rows of the joints `dims` without jumps in joints without limits, which start within half a turn of
-        `qpos`.
+        """Return `rows` of the joints `dims`, changed so that joints without limits do not jump between rows.
+
+        The first row of such a joint is within half a turn of `qpos`.
         """
         endless = np.flatnonzero(np.isin(dims, self._wrapping))
         turning = np.concatenate([qpos[dims[endless]][None], rows[:, endless]])

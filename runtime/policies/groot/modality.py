@@ -93,7 +93,10 @@ def parse_modalities(reply: object) -> Modalities:
 
 
 def _contract(contract: Mapping[str, Any]) -> Modalities:
-    """Return modalities from flat lists of keys; everything that the server does not state follows the deployment."""
+    """Return the modalities of a server that answers with flat lists of keys (StarVLA).
+
+    `contract` is that answer. For everything that it does not state, the deployment's declarations are used.
+    """
     horizon: Any = contract.get("action_horizon")
     rows = horizon if type(horizon) is int and 0 < horizon <= _MOST_ROWS else 1
     return Modalities(

@@ -166,7 +166,10 @@ class JointPlausibility:
         return bool(lately) and all(self._away(sample.joints, held, allowed, but) for sample in lately)
 
     def pop_outage(self) -> float:
-        """Return the duration of the outage before the trusted joints [s]; 0 on the second call."""
+        """Return the duration [s] of the outage after which the present samples became trusted, and forget it.
+
+        The result is 0 if no samples are trusted, if there was no outage, or if its duration was returned before.
+        """
         missing, self._missing = (0.0 if self._chain is None else self._missing), 0.0
         return missing
 
