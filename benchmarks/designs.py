@@ -165,9 +165,10 @@ class PartStore:
 
 
 def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
-    """Yield the largest error over all common rates; between computed rates it is bounded.
+    """Yield the largest probability of a false finding over all success rates that two equal checkpoints may have.
 
-    Simulated errors may exceed alpha by three standard errors.
+    For designs with an exact boundary the figure is an upper bound, which also holds between the computed rates. For
+    other designs the error is simulated at some rates, and may exceed alpha by three standard errors.
     """
     if exact := boundary_of(case, n):
         largest, bound = exact.error()
@@ -460,7 +461,10 @@ def _error(share: float, runs: int) -> float:
 
 
 def _of_scipy(rates: Rates, n: int) -> float:
-    """Return the power of scipy's test, by enumeration of all tables; of tables equal by symmetry one is tested."""
+    """Return the power of scipy's test for samples of size `n`, by enumeration of all tables of results.
+
+    The test is applied to only one of several tables that are equal by symmetry.
+    """
     from scipy.stats import barnard_exact, binom
 
     first, second = (binom.pmf(np.arange(n + 1), n, rate) for rate in rates)

@@ -251,9 +251,10 @@ def _variable_of(libraries: _Libraries, size: int) -> Any:
 
 @functools.cache  # cache: to compile it takes longer than a thousand chunks
 def _scan_of(libraries: _Libraries, config: Config) -> Any:
-    """Return the function that computes joints and their bounds for an arm, and the poses and bounds of a chunk.
+    """Return a function that computes joints and their bounds from an arm and from the poses and bounds of a chunk.
 
-    It is compiled with the first arm of each number of joints, which takes longer than a thousand chunks.
+    The function is compiled when it is called with the first arm that has a given number of joints. The compilation
+    takes longer than a thousand chunks.
     """
     jax, jaxlie, jaxls = libraries.jax, libraries.jaxlie, libraries.jaxls
     jnp = jax.numpy

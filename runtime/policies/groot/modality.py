@@ -172,7 +172,10 @@ def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
 
 
 def _enum_name(value: object) -> str:
-    """Return the name of an enumeration member, which servers state by its name or its value."""
+    """Return the name of an enumeration member, in capitals.
+
+    Servers send either the member's name or its value, which differ in spelling.
+    """
     return str(value).upper().replace("+", "_")
 
 
