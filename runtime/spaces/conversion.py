@@ -189,8 +189,9 @@ class ActionSpaces(EndEffectors):
     def _absolute_poses(
         self, rows: Float64, layout: PoseRows, chunk: ActionChunk, observation: Observation
     ) -> Float64:
-        """Return absolute vectors in each arm's own frame, followed by the joints after the poses: [H, 8 * arms
-        + n].
+        """Return rows [H, 8 * arms + n]: absolute arm vectors in each arm's own frame, then n absolute joint values.
+
+        The joint values are those that follow the poses in each row.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         vectors, joints = layout.decode(rows)

@@ -227,7 +227,8 @@ def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Recor
 def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Float64) -> None:
     """Write to `goal` [12] the target pose relative to the base of the arm's own chain.
 
-    That base is the last frame of the carrier's frames `carried`.
+    `carried` has the frames of the carrier, i.e. of the chain that carries the arm, in sequence. The last of them is
+    the base of the arm's own chain.
     """
     base = len(carried) - 1
     matrix = matrix_of(
