@@ -354,7 +354,10 @@ def measure(seconds: float, seed: int | None = None, *, long: bool = False) -> R
 
 
 def _rows(policy: str) -> None:
-    """Create the scene and the checkpoint of the trials, whose policy server has the url `policy`."""
+    """Create the database rows of the scene and of the checkpoint that the trials use.
+
+    `policy` is the url of the checkpoint's policy server.
+    """
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     import django
 

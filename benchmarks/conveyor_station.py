@@ -74,7 +74,10 @@ class DeferredPicturesEnvironment(Environment):
         return {key: np.broadcast_to(digits[:, None, None], (4, 4, 3)).copy() for key in self._keys}
 
     def render(self, stamp: UInt8) -> dict[str, UInt8]:
-        """Return the overhead image of the frame whose number is in `stamp`, RGB [H, W, 3] by camera key."""
+        """Return the images of one frame by camera key, RGB uint8 [H, W, 3]; the only camera is the overhead camera.
+
+        `stamp` is a small image that encodes the number of the frame.
+        """
         q, state = self._frames[int.from_bytes(stamp[:, 0, 0].tobytes(), "big")]
         drawn = self._renderer.draw(q, state)
         return {key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in drawn.items()}

@@ -77,7 +77,10 @@ def _mean(truth: float, draw: Callable[[Chance, int], NDArray[np.float64]]) -> C
 
 
 def _scenes(*rates: float) -> Case:
-    """Return the case of successes over several scenes, n trials in each."""
+    """Return the case of the success rate over several scenes, with n trials in each.
+
+    `rates` are the true success rates of the scenes.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         scenes = {str(i): (chance.random(n) < rate).tolist() for i, rate in enumerate(rates)}
@@ -88,8 +91,10 @@ def _scenes(*rates: float) -> Case:
 
 
 def _conditions(first: float, second: float, spread: float, trials: int) -> Case:
-    """Return the case of two checkpoints over conditions between which the first one's rate varies by up to
-    `spread`.
+    """Return the case of the difference between two checkpoints, measured under n conditions with `trials` trials each.
+
+    The second checkpoint has the success rate `second` under every condition. The first checkpoint's rate differs from
+    condition to condition: it is `first` plus or minus at most `spread`.
     """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
@@ -105,7 +110,10 @@ def _conditions(first: float, second: float, spread: float, trials: int) -> Case
 
 
 def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
-    """Return the case of successes of two checkpoints whose rates are uniform random."""
+    """Return the case of `interval` for the difference between the success rates of two checkpoints.
+
+    In each run the two rates are drawn uniformly from 0 to 1.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = chance.random(2)
@@ -137,7 +145,10 @@ def _per_hour(chance: Chance, n: int, draws: int) -> bool:
 
 
 def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, allowed: str) -> Case:
-    """Return the case of the mean of one number per trial, which `draw` generates with the mean `truth`."""
+    """Return the case of the interval for the mean of one number per trial.
+
+    `draw` generates the numbers, whose true mean is `truth`. `allowed` is the required coverage.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         estimate = average(draw(chance, n).tolist())

@@ -168,9 +168,10 @@ class PartStore:
 
 
 def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
-    """Yield the largest error over all common rates; between computed rates it is bounded.
+    """Yield the largest probability of a false finding over all success rates that two equal checkpoints may have.
 
-    Simulated errors may exceed alpha by three standard errors.
+    For designs with an exact boundary the figure is an upper bound, which also holds between the computed rates. For
+    other designs the error is simulated at some rates, and may exceed alpha by three standard errors.
     """
     if exact := boundary_of(case, n):
         largest, bound = exact.error()
@@ -402,10 +403,11 @@ def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, 
 
 
 def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability of stopping for each course of rates: float64 [courses].
+    """Return the probability that a comparison stops, for each course of success rates: float64 [courses].
 
-    `rates` [courses, pairs] are the common success rates at each pair. With a margin, the second checkpoint's rate is
-    (1 - margin) times the given one, and the first checkpoint's rate is larger than that by the margin.
+    `rates` [courses, pairs] is the success rate that both checkpoints have at each pair of trials. If the design has a
+    margin, the second checkpoint's rate is (1 - margin) times the given rate, and the first checkpoint's rate is the
+    second's plus the margin.
     """
     margin = exact.margin or 0.0
     pairs = exact.looks[-1].first
@@ -466,7 +468,10 @@ def _error(share: float, runs: int) -> float:
 
 
 def _of_scipy(rates: Rates, n: int) -> float:
-    """Return the power of scipy's test, by enumeration of all tables; of tables equal by symmetry one is tested."""
+    """Return the power of scipy's test for samples of size `n`, by enumeration of all tables of results.
+
+    The test is applied to only one of several tables that are equal by symmetry.
+    """
     from scipy.stats import barnard_exact, binom
 
     first, second = (binom.pmf(np.arange(n + 1), n, rate) for rate in rates)

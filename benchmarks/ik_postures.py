@@ -62,7 +62,10 @@ def drift(robot: Robot, kinematics: Kinematics) -> Float64:
 
 
 def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Float64:
-    """Return joints [T, D] through random postures with smooth acceleration; the same for the same `number`."""
+    """Return joints [T, D] that move smoothly through a sequence of random postures.
+
+    The path depends only on the robot, `number`, and the number and length of its legs.
+    """
     chance, dims = np.random.default_rng([0, number]), arm_dims(robot)
     low = np.maximum(robot.lower + _ROOM, -_ENDLESS)[dims]
     high = np.minimum(robot.upper - _ROOM, _ENDLESS)[dims]

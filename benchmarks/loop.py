@@ -91,7 +91,16 @@ def case(rate: float, seconds: float, assignments: Sequence[str], without: str =
 def _run(
     lab: RunningLab, sleepers: Sequence[Sequence[str]], seconds: float
 ) -> tuple[Mapping[str, Any], list[Any], dict[str, Any]]:
-    """Run once with viewers; return the final state, the results of the comparison loops, and processor usage."""
+    """Perform one run while pages view it.
+
+    Args:
+        lab: Lab with the station.
+        sleepers: Arguments of each loop of `benchmarks.sleeper` that runs at the same time, for comparison.
+        seconds: Duration of the run [s].
+
+    Returns:
+        Final state, results of the comparison loops, and processor usage.
+    """
     with closing(LivePage(lab.visitor, STATION)) as shared:
         set_up(shared)
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)

@@ -7,15 +7,15 @@ virtual, and there are no sockets. Design decisions:
 * The policy (runtime/simulation/scripts/chase.py) gets an image per request, extrapolates the block's motion, and
   answers with 50 rows at 30 Hz. It knows the lag of robots and the ends of the belt, but not when the belt will turn.
 * The belt changes its speed every 2.6 s on average, at 60 to 100 mm/s: far below the arm's limits, so that only timing
-  matters. On target: fingertips at most half of a block's edge, 20 mm, from their place next to it. Success: on target
-  for two thirds of the 20 s of the course. This threshold was set when the shares were known, between those of `async`
-  at 8 and at 15 ticks; sync is far below it wherever it fails. The shares of every course are reported for any other
-  threshold.
+  matters. The fingertips are on target if they are at most half of a block's edge, 20 mm, from their place next to it.
+  An episode succeeds if they are on target for two thirds of the 20 s of the course. This threshold was set when the
+  results were known: it is between the shares of `async` at delays of 8 and 15 ticks, and `sync` is far below it
+  wherever `sync` fails. The share of every course is reported, so that any other threshold can be applied.
 * A strategy that requests during motion does so back to back, but at most 10 times per second. `sync` executes 10
   rows, a third of a second, of each chunk: with fewer it mostly waits, with more it notices too late that the belt has
   turned. All other parameters have their defaults.
-* Images are rendered when the policy requests, of exactly the requested frame: the station carries a stamp with the
-  frame number instead of each image. So an episode takes about a second.
+* Observations contain a stamp with the frame number instead of each image. The image of that frame is rendered only
+  when the policy requests it, so that an episode takes about a second.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Cost of recording, and losses by kills: a station's recorder, LeRobot's writer, kill -9, a long list.
+"""Cost of recording, and losses when processes are killed.
 
-One station records three cameras of 640x480 at 30 Hz, ends the run and publishes the episode; others record in parallel
-to busy loops. Then our recorder alone and LeRobot's own writer receive the same frames at the same pace, if an
-interpreter with LeRobot is available: this one, or those in EVA_LEROBOT_PYTHONS. Then processes are killed at random
-moments, and the page of 10,000 episodes is requested.
+One station records three cameras of 640x480 at 30 Hz, ends the run and publishes the episode. Other stations record in
+parallel to busy loops. Then our recorder alone and LeRobot's own writer receive the same frames at the same pace, if an
+interpreter with LeRobot is available: this one, or those in EVA_LEROBOT_PYTHONS. Then processes are killed (kill -9) at
+random moments, and the page that lists 10,000 episodes is requested.
 """
 
 from __future__ import annotations

@@ -25,7 +25,11 @@ def main() -> None:
 
 
 def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep repeatedly for the rest of the period since the last wake-up; return the wake-ups."""
+    """Sleep repeatedly, each time for the rest of the period since the last wake-up.
+
+    Returns:
+        Times of the wake-ups [s], numbers of the wake-ups, and no lateness, because there are no deadlines.
+    """
     woke = [time.monotonic()]
     end = woke[0] + seconds
     while woke[-1] < end:
@@ -38,7 +42,8 @@ def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[
 def _deadlines(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
     """Sleep repeatedly until start + n * period; missed deadlines are skipped.
 
-    Return three lists with an entry per wake-up: its time [s], the number n of the step, and its lateness [s].
+    Returns:
+        Times of the wake-ups [s], numbers n of their deadlines, and lateness of the wake-ups [s].
     """
     clock = MonotonicClock()
     woke: list[float] = []

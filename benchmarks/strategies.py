@@ -217,7 +217,7 @@ def _jerk(actions: Float64) -> float:
 
 
 def _offset(reference: Reference, cell: Cell, log: Log, begin: int) -> float:
-    """Return the delay of the published actions relative to the reference [steps], to 1e-6."""
+    """Return the delay of the published actions relative to the reference [steps], rounded to 6 decimals."""
     ticks = [tick for tick in log.executed[begin:] if tick.makers]
     if not ticks:
         return 0.0

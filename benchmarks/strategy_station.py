@@ -166,7 +166,11 @@ def _run(spec: StationSpec, policy: TablePolicy) -> tuple[int, Mapping[int, Floa
 
 
 def _answer(start: Float64, case: Case) -> Answering:
-    """Return the policy that both use: disagreeing chunks around `start`, rounded to float32 as in messages."""
+    """Return the policy that the station and the step loop both use.
+
+    The policy answers with chunks around `start` [D] that disagree with each other. Its rows are rounded to float32, as
+    they are in messages.
+    """
     steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
     reference = Reference(case.control_hz)
     chunk_of = with_disagreement(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))

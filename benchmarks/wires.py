@@ -19,7 +19,10 @@ _GROWTH = "<= 10"  # [MB] in ten minutes; retaining one image in two hundred wou
 
 
 def measure(seconds: float) -> Report:
-    """Measure `roundtrip_*_ms.PROTOCOL`, `ratio_to_openpi_client`, `age_*_ms.TRANSPORT` and others."""
+    """Measure all policy protocols and all transports.
+
+    The figures include `roundtrip_*_ms.PROTOCOL`, `ratio_to_openpi_client` and `age_*_ms.TRANSPORT`.
+    """
     rows = [*wires_policies.measure(seconds), *wires_transports.measure(seconds)]
     for row in rows:
         for key in ("absent", "peer_absent"):

@@ -74,7 +74,8 @@ class CaseSetup:
 class CaseEndpoints:
     """Transport and cameras of the receiving side.
 
-    `born` is the source of an image's time: the number in its "strip" or "bar", or its "due" time.
+    `born` says how the time at which an image began is determined: "strip" and "bar" are marks in the image that encode
+    the image's number, and "due" is the time at which an image of a recording was due.
     """
 
     transport: Mapping[str, Any]
@@ -227,7 +228,10 @@ def _dataset(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _file_cameras(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case of a recording with video files in place of its own cameras."""
+    """Set up the case in which a recording is played, and file cameras play its videos.
+
+    The recording's own pictures are replaced by those of the file cameras.
+    """
     transport, videos = _recorded(stage)
     cameras = {key: {"kind": "file", "path": str(path)} for key, path in videos.items()}
     return CaseEndpoints(transport, cameras, born="due")

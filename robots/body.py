@@ -35,9 +35,10 @@ class BodyTables(NamedTuple):
 class Body:
     """Body of a robot: its `parts` and their `poses`.
 
-    A part is named by the group that moves it and its link, e.g. "left_arm/link2". If the URDF describes one of several
-    equal arms, there is one copy of the tree per arm; a URDF of the whole body exists once. `jaws` maps each group with
-    a gripper to the indices of its finger parts; `above` [P] is the index of each part's parent, -1 for a root.
+    The name of a part consists of the group that moves the part and the part's link, e.g. "left_arm/link2". If the URDF
+    describes one of several equal arms, there is one copy of the tree per arm; a URDF of the whole body exists once.
+    `jaws` maps each group with a gripper to the indices of the gripper's finger parts. `above` [P] is the index of each
+    part's parent, -1 for a root.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -104,7 +105,7 @@ class Body:
 
     @property
     def tables(self) -> BodyTables:
-        """Tables from which `poses` is computed, for other implementations."""
+        """Tables from which `poses` is computed, so that other implementations can compute the poses too."""
         return BodyTables(self._tables, self._coupling, self._offsets, self._low, self._high, self.above)
 
     def poses(self, q: Float64) -> Float64:
@@ -166,8 +167,9 @@ class _Copy:
         return np.array([-1, *(start + parent for parent in parents)], dtype=np.intp)
 
     def part(self, link: str) -> str:
-        """Return the name of a link's part, which begins with the group that moves the link, or with the copy's first
-        group.
+        """Return the name of a link's part: a group's name, "/" and the link's name.
+
+        The group is the one that moves the link. If no group moves the link, the first group of this copy is named.
         """
         at = link
         while at in self._movers:

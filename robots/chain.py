@@ -85,7 +85,7 @@ class Chain:
         return self._tail
 
     def forward(self, q: Float64) -> Float64:
-        """Return the pose of the tip in the frame as transforms [..., 4, 4], for joints [..., n]."""
+        """Return the pose of the tip in the chain's first frame as transforms [..., 4, 4], for joints [..., n]."""
         steps = self._steps(q)
         transform = steps[..., 0, :, :]
         for index in range(1, steps.shape[-3]):

@@ -92,7 +92,10 @@ class Clearance:
         self._select_pairs(*self._telling(robot))
 
     def distances(self, q: Float64) -> Float64:
-        """Return the distances of the pairs [m], [..., K], for the robot's vector [..., D]; negative for overlap."""
+        """Return the distance [m] between the capsules of each of the K checked pairs, as [..., K].
+
+        `q` [..., D] are values of the robot's vector. A distance is negative if the capsules overlap.
+        """
         if q.ndim == 1:
             return self._distances(q)
         flat = q.reshape(-1, q.shape[-1])
@@ -176,7 +179,12 @@ def _mirror_key(pair: tuple[str, str]) -> tuple[str, ...]:
 
 
 def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _Indices, _Indices]:
-    """Return pairs of capsules that are not neighbours (first, second), and capsules that may reach the table."""
+    """Return the pairs of capsules that may collide, and the capsules that may reach the table.
+
+    The result is the first and the second capsule of each pair, then the capsules for the table. Capsules of
+    neighbouring parts, and pairs that the robot's [collision] ignores, are left out. `parts` is the part of each
+    capsule.
+    """
     moved = body.moving_mask()[parts]
     grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
     reaching = np.zeros(robot.dim, dtype=bool)

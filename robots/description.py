@@ -42,8 +42,9 @@ class Table(BaseModel):
 
 
 class TipTable(Table):
-    """Frame between the fingertips, in `eef_link`: z in the direction in which they point, y in that in which
-    they open.
+    """Frame between the fingertips, relative to `eef_link`.
+
+    Its z axis is the direction in which the fingertips point. Its y axis is the direction in which the fingers open.
     """
 
     xyz: Triple

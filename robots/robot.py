@@ -22,11 +22,12 @@ EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """Gripper, i.e. one number of a group in the robot's own `unit`; `index` is its position in the group.
+    """Gripper: one number of a group, in the robot's own `unit`; `index` is the number's position in the group.
 
-    `fingers` are URDF joints with their values [rad or m] at `lower` and at `upper`; `apart` is the distance of the
-    fingers [m] at `close` and at `open`, None if unknown. A binary gripper switches at `threshold`, with a `hysteresis`
-    as a share of its travel; for other grippers both are None.
+    The number moves from `lower` to `upper`, and the gripper is open at `open` and closed at `close`. `fingers` maps
+    URDF joints to their two values [rad or m], the first for `lower` and the second for `upper`. `apart` has the
+    distance between the fingers [m] at `close` and at `open`; it is None if unknown. A binary gripper switches at
+    `threshold`, with a `hysteresis` as a share of its travel; for other grippers both are None.
     """
 
     index: int

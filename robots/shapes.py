@@ -35,7 +35,10 @@ class Shape:
     file: Path | None = None
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """Return the lower and upper corner [3] of the shape's box in its own frame [m], before `origin`."""
+        """Return the lower and upper corner [3] of the box around the shape [m].
+
+        The box is in the shape's own frame, i.e. `origin` is not applied yet.
+        """
         return shape_bounds(self.kind, self.size, self.file)
 
     def box_corners(self) -> Float64:

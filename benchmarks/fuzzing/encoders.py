@@ -338,7 +338,11 @@ class EncoderOffsetScenario(Bench):
         return problems
 
     def _bound(self, begins: Float64) -> float:
-        """Return the largest displacement [rad] that may be trusted: the following error plus the encoder's offset."""
+        """Return the largest displacement [rad] that control may accept without distrusting the joints.
+
+        It is the following error plus the offset of the faulty encoder. `begins` [D] are the joints at which the fault
+        begins, which matter if the encoder also scales.
+        """
         scaled = abs((self._scale - 1.0) * begins[self._joint])
         return float(self.safety.following_error + abs(self._offset) + scaled + 0.1)
 

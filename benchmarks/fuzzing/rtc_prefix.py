@@ -288,7 +288,11 @@ def _plan(data: Path, case: Scenario) -> StationSpec:
 
 @dataclass(slots=True)
 class Planned:
-    """Actions planned by control step, before safety, and the steps without a run."""
+    """Record of a run, by control step.
+
+    `rows` has the planned action of each step, before safety. `held` are the steps without a run, and `end` is the end
+    of the run.
+    """
 
     rows: dict[int, Float64]
     held: set[int]

@@ -150,9 +150,10 @@ def _ends(tree: Urdf, name: str) -> tuple[float, float]:
 
 
 def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[str, float]:
-    """Return the non-zero rest values of the joints of optional groups, for drawing while those groups do not move.
+    """Return the rest values of the joints of torso, head, base and other optional groups, without zeros.
 
-    Only the first arm gets them; {} for every other limb.
+    The values are used for drawing while these groups do not move. Only the first arm's group states them; the result
+    is {} for every other limb.
     """
     if limb.kind != "arm" or limb is not next(guess for guess in limbs if guess.kind == "arm"):
         return {}

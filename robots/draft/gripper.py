@@ -1,4 +1,8 @@
-"""Gripper in a URDF: its number, open end, distance of the fingers, and frame of their tips."""
+"""Draft of the gripper of an arm, derived from the URDF.
+
+The draft has the joint that drives the gripper, which of its ends is open, how far the fingers part, and the frame
+between the fingertips.
+"""
 
 from __future__ import annotations
 

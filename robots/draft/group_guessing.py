@@ -103,7 +103,10 @@ class _Skeleton:
         return 0 if name is None else 1 + self.depth(self.parent[name])
 
     def fingers(self, wheels: set[str]) -> dict[str, str | None]:
-        """Return by finger joint the joint that carries its hand, None if that is the root."""
+        """Return a map from each finger joint to the joint that carries its hand, None if the root carries the hand.
+
+        `wheels` are the joints of wheels, which are no fingers.
+        """
         names: set[str] = set()
         for name in reversed(self.names):  # from the tips inwards
             if name not in wheels and names.issuperset(self.children(name)) and self._is_finger(name):
@@ -189,7 +192,11 @@ def _limbs(
 
 
 def _trunk(tree: Urdf, joints: tuple[str, ...]) -> int:
-    """Return the number of joints of a torso or base at the beginning of a row that ends in an arm."""
+    """Return how many joints at the beginning of `joints` belong to a torso or base that carries an arm.
+
+    `joints` is an unbranched sequence of joints that ends at a tip. The result is 0 if the rest is too short for an
+    arm.
+    """
     cut = next((i for i, name in enumerate(joints) if _kind_of(name) not in ("torso", "base")), 0)
     slides = any(tree.joint(name).kind == "prismatic" for name in joints[:cut])
     return cut if len(joints) - cut >= (_BEYOND_LIFT if slides else _BEYOND_TURN) else 0
@@ -212,7 +219,10 @@ def _base(tree: Urdf) -> str:
 
 
 def _one_gripper(skeleton: _Skeleton, fingers: Sequence[str]) -> bool:
-    """Return True if one number opens and closes the fingers; more fingers, or jointed ones, are a hand."""
+    """Return True if the fingers are a gripper, which one number opens and closes.
+
+    More fingers, or fingers with several joints, are a hand instead.
+    """
     return 0 < len(fingers) <= _FORK and not any(skeleton.parent[name] in fingers for name in fingers)
 
 

@@ -1,5 +1,6 @@
-"""Copy of a URDF with its visuals into a robot's folder, with its meshes, and with stand-ins for shapes that cannot be
-shown.
+"""Copy of a URDF with its visuals and meshes into a robot's folder.
+
+Shapes that cannot be shown are replaced by simple stand-ins.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def copy_urdf(tree: Urdf, target: Path) -> MeshCopyReport:
     """Write the URDF to `target`, and its meshes to the folder meshes/ next to it.
 
     If everything can be shown, the URDF is copied unchanged. Otherwise visuals of missing meshes are replaced by
-    cylinders from joint to joint; if nothing can be shown, the visuals of all links are.
+    cylinders from joint to joint. If nothing can be shown, all links get such cylinders.
     """
     robot = parsed(tree.path, comments=True)
     work = _UrdfCopy(tree, target, robot)
@@ -132,7 +133,7 @@ class _UrdfCopy:
         self.plain += [name] if name not in self.plain else []
 
     def stand_ins(self) -> None:
-        """Add cylinders to links that lost all visuals; to all links if nothing is shown at all."""
+        """Add cylinders to links that lost all visuals; if no link has a visual left, add them to all links."""
         links = self._robot.findall("link")
         if not any(link.find("visual") is not None for link in links):
             self._bare = links

@@ -56,9 +56,10 @@ class PostureSearch:
         self._draw = np.random.default_rng(0)  # fixed seed: the same URDF gives the same draft
 
     def home(self) -> Float64:
-        """Return the home pose, or, if links touch in it, the nearest posture found with the fewest touching pairs.
+        """Return the home pose or, if links touch in it, a posture near it in which as few pairs as possible touch.
 
-        Mirrored arms have mirrored postures.
+        Of several such postures that were found, it is the one nearest to the home pose. Mirrored arms have mirrored
+        postures.
         """
         home = self._robot.poses["home"]
         dims = self._dims()

@@ -77,10 +77,11 @@ class SourceWithCameras(Source):
         return self._source.describe_fault(fault)
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
-        """Return the health of each camera by its key: kind, source, condition, its beginning and reason, losses, age.
+        """Return the health of each camera, by camera key.
 
-        "since" is the time on our clock at which the condition began [s]. "age" is the age of the newest picture [s],
-        None before the first.
+        The health is a map with "kind", "source", "condition", "since", "why", "losses" and "age". "since" is the time
+        on our clock at which the condition began [s], and "why" is the reason for the condition. "age" is the age of
+        the newest picture [s], None before the first.
         """
         return {camera.key: self._health_dict(camera) for camera in self._cameras}
 

@@ -35,10 +35,12 @@ class UnreadableDocument(ValueError):
 
 
 def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]:
-    """Return the table in `text`.
+    """Parse a TOML text and return its table.
+
+    `what` names the document in error messages; `largest` is the largest permitted size of the text.
 
     Raises:
-        UnreadableDocument: the text is too large, too deep or invalid; `what` is its name in the message.
+        UnreadableDocument: the text is too large, too deep or invalid TOML; the message contains `what`.
     """
     _require_small(text, what, largest)
     _require_flat(text, what, _TOML)

@@ -171,7 +171,7 @@ class ClockStepDetector:
 
 
 def _off(interval: float, period: float) -> float:
-    """Return the distance of an interval from the nearest multiple of the period, where zero is no multiple [s]."""
+    """Return the distance [s] of an interval from the nearest positive multiple of the period."""
     return abs(interval - max(1, round(interval / period)) * period)
 
 

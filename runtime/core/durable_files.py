@@ -99,7 +99,7 @@ def _open_draft(draft: Path, mode: int) -> Iterator[BinaryIO]:
 
 
 def _is_at(file: BinaryIO, path: Path) -> bool:
-    """Return True if `path` still names this file, because another writer may have replaced it."""
+    """Return True if `path` still names the open file `file`. It does not if another writer has replaced the file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:

@@ -1,4 +1,7 @@
-"""Environment variables of a station: without the web's secrets, and with its own secrets by variable name."""
+"""Environment variables of a station's processes.
+
+Secrets of the web are removed. Secrets of the station itself are read from variables whose names the deployment states.
+"""
 
 from __future__ import annotations
 

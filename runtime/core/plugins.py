@@ -56,7 +56,10 @@ def variants(package: str) -> Variants:
 
 
 class UnreadSection(BaseModel):
-    """Table of a deployment that this process does not use: kept unchanged, with its kind, and without an import."""
+    """Table of a deployment that this process does not use.
+
+    Its keys, with `kind`, are kept as they are. The module of its kind is not imported.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 

@@ -44,11 +44,11 @@ def enter_realtime(priority: int) -> str:
 
 
 def enter_realtime_below(priority: int) -> str:
-    """Make this process punctual with the priority below `priority`; return the scheduling class obtained.
+    """Make this process punctual, at a priority one below that of a process that enters with `priority`.
 
-    It is for a process with threads and large, sparse memory. Threads started later inherit the class, unless they call
-    `leave_realtime`. Memory mapped so far is locked page by page on first use; later mappings are not locked, because
-    that could be refused in the middle of the work.
+    Return the scheduling class obtained. This is for a process with threads and large, sparse memory. Threads started
+    later inherit the class, unless they call `leave_realtime`. Memory mapped so far is locked page by page on first
+    use. Later mappings are not locked, because a lock could be refused in the middle of the work.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     _fine_timers(libc)

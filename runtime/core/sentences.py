@@ -150,7 +150,10 @@ def to_wire(text: str) -> dict[str, Any]:
 
 
 def within(tree: object) -> dict[str, dict[str, Any]]:
-    """Return ids and arguments of the sentences in nested maps and lists, by path (as in `texts`)."""
+    """Return ids and arguments of the sentences in nested maps and lists.
+
+    The keys of the result are paths: the keys to a sentence, joined by dots, as in `texts`.
+    """
     return {path: identity(text) for path, text in texts(tree).items() if isinstance(text, Sentence)}
 
 

@@ -289,10 +289,10 @@ class _Assembly:
         return written(splits)
 
     def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
-        """Return the lines of the list of episodes.
+        """Return `lines`, the new list of episodes, with the additional keys that the sources' lists have.
 
-        They keep the keys of the sources' lines that the format does not define; a key whose values cannot be written
-        in this version is reported as left out.
+        Additional keys are those that the format does not define. If the values of such a key cannot be written in this
+        version of the format, the key is reported as left out.
         """
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]

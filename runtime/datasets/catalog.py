@@ -269,7 +269,15 @@ class Catalog:
 
 
 def single_file_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
-    """Return the line of an episode whose files, with number `number`, contain no other; its rows start at `first`."""
+    """Return the line of an episode that has its files to itself, i.e. they contain no other episode.
+
+    Args:
+        info: Content of info.json.
+        number: Number of the files.
+        tasks: Tasks of the episode.
+        length: Number of the episode's rows.
+        first: Index of the episode's first row in the dataset.
+    """
     line: Line = {"episode_index": number, "tasks": list(tasks), "length": length}
     if info["codebase_version"] != layout.V30:
         return line

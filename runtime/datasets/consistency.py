@@ -54,7 +54,10 @@ class _Remark(str):
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Result of a check, in sentences: `problems` contradict the metadata, `remarks` are not damage."""
+    """Result of a check, in sentences.
+
+    `problems` are contradictions between the files and the metadata. `remarks` are findings that are no damage.
+    """
 
     problems: list[str]
     remarks: list[str]
@@ -376,12 +379,12 @@ def is_rounding_error(
 ) -> bool:
     """Return True if LeRobot's use of single precision explains the difference between two statistics of a column.
 
-    LeRobot sums float32, with variance E[x^2] - E[x]^2. Source: the sum of n numbers in sequence has an error of at
-    most n u sum|x|, u = 2^-24 (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 4.2). The variance
-    has three such factors.
+    LeRobot adds up float32 values, and computes the variance as E[x^2] - E[x]^2. The sum of n numbers in sequence has
+    an error of at most n u sum|x|, u = 2^-24. Source: Higham, Accuracy and Stability of Numerical Algorithms, 2002,
+    section 4.2. Such an error occurs three times in the variance: once in E[x^2] and twice in the square.
 
     Args:
-        name: Name of the statistic; False for any other than "mean" and "std".
+        name: Name of the statistic; the result is False for any other than "mean" and "std".
         given: Statistic in the dataset.
         value: Statistic computed from the rows in double precision.
         known: Finite rows [N, ...] of the column.

@@ -79,7 +79,8 @@ def uuids_of(dataset: Path) -> dict[int, str]:
 def content_uuid(dataset: Dataset, index: int, place: int | None = None) -> str:
     """Return a uuid derived from the episode's content: columns by name, tasks, encoded images.
 
-    `place` is the index that the episode has in a copy without gaps, None if it is `index`. Raises: RecordingError.
+    `index` is the episode's index in `dataset`. `place` is the index that the episode has in a copy without gaps; None
+    means that it is `index`, too. Raises: RecordingError.
     """
     entry, table = dataset.entry(index), dataset.table(index)
     stored = layout.image_keys(dataset.features)

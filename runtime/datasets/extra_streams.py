@@ -16,9 +16,10 @@ from runtime.datasets.reader import Dataset
 
 
 class _Kind(NamedTuple):
-    """Kind of extra stream: the candidate names of its column, and its attributes.
+    """Kind of extra stream.
 
-    `mapped` is its attribute in a ColumnMapping, `read` that in a RecordedEpisode.
+    `mapped` is the attribute of a ColumnMapping that names the stream's column. `read` is the attribute of a
+    RecordedEpisode that has the stream's values. `columns` are the names that the column may have.
     """
 
     mapped: str

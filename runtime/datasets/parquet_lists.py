@@ -45,7 +45,11 @@ def read_statistics(root: Path) -> list[Line]:
 
 
 def read_tasks(root: Path) -> list[Line]:
-    """Return {"task_index", "task"} for each row of meta/tasks.parquet, whose index as a pandas frame is the task."""
+    """Return {"task_index", "task"} for each row of meta/tasks.parquet.
+
+    LeRobot writes this file with pandas, as a frame whose index contains the tasks. The result is [] if there is no
+    file.
+    """
     path = root / layout.TASKS_V30
     if not path.is_file():
         return []

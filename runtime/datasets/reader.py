@@ -249,7 +249,10 @@ class _Rows(Sequence[Mapping[str, Any] | None]):
 
 
 def open_dataset(root: Path | str) -> Dataset:
-    """Open the LeRobot dataset in `root`. Raises: RecordingError describing the folder's content instead."""
+    """Open the LeRobot dataset in the folder `root`.
+
+    Raises: RecordingError if the folder is missing or contains no readable dataset. The message says what was found.
+    """
     root = Path(root)
     if not root.is_dir():
         raise RecordingError(f"there is no dataset folder {root}")

@@ -122,7 +122,11 @@ class VideoFrames(ImageSequence):
             raise RecordingError(f"{self._path} does not start with a key frame")
 
     def _packets(self) -> Iterator[Any]:
-        """Yield the packets to number: all, or for a segment those from the key frame before it to its end."""
+        """Yield the packets whose frames are numbered.
+
+        These are all packets of the file or, for a segment, the packets from the last key frame before the segment to
+        the segment's end.
+        """
         end = None
         if self._stretch is not None:
             self._container.seek(int(self._stretch.start / self._stream.time_base), stream=self._stream)

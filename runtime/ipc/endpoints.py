@@ -287,9 +287,9 @@ class Endpoints:
         return content
 
     def is_listening(self, name: str) -> bool:
-        """Return True if a process listens at a socket `name`, whatever the files contain.
+        """Return True if a process listens at a socket called `name`; the files of endpoints are not consulted.
 
-        False also if that is unknown.
+        The result is also False if it cannot be determined.
         """
         for folder in _folders(self._station_dir):
             with suppress(OSError):  # missing or not accessible

@@ -168,7 +168,10 @@ def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
 
 
 def _fields(parts: Sequence[str]) -> dict[str, Any]:
-    """Return uuid and reason of a long press, as far as they are in `parts`, its beginning and its end."""
+    """Return uuid and reason of a long e-stop press, as far as they are found.
+
+    `parts` are the beginning and the end of the message. A value in the beginning has precedence over one in the end.
+    """
     pattern = r'"%s"\s{0,9}:\s{0,9}"([^"\\]{1,240})'
     matches = ((key, re.search(pattern % key, part)) for part in reversed(parts) for key in ("uuid", "why"))
     return {key: match[1] for key, match in matches if match}

@@ -30,9 +30,10 @@ TURN_BYTES = 16 << 20  # [bytes] read from a socket in one turn
 
 
 def _press_in(call: IncomingMessage) -> Command | None:
-    """Return the press in a message, None if there is none.
+    """Return the e-stop press in a message, None if there is none.
 
-    If the content has no kind, the press is also sought in the following frames, and across both.
+    If the message's content has no kind, the press is also sought in the frames that follow, which are given as the
+    signature, and in content and signature joined together.
     """
     press, signature = parse_packed_press(call.payload), call.signature
     if press is not None or not signature or kind_of(call.payload):

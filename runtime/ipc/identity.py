@@ -142,7 +142,11 @@ def _unverified(command: Command, role: str) -> Command:
 
 
 def unverified_reason(command: Command) -> str:
-    """Return the reason to refuse a command whose sender is not verified; "" if it is, or for a stop."""
+    """Return the reason to refuse a command whose sender could not be verified.
+
+    The result is "" if the sender is verified. Stops are executed whoever sends them: callers do not check them with
+    this function.
+    """
     if command.role != UNVERIFIED:
         return ""
     return _FORGED(kind=command.kind)

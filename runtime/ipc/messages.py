@@ -2,7 +2,8 @@
 
 A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type". Received
 messages are checked against the fields' annotations, so code behind `decode` gets valid types only. Messages with a
-sentence also carry its `id` and `arguments`, which are derived from it; after `decode` it is a `Sentence` again.
+sentence also carry the sentence's `id` and `arguments`, which are derived from it. After `decode` the sentence is a
+`Sentence` again.
 """
 
 from __future__ import annotations

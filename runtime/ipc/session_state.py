@@ -79,7 +79,7 @@ class SessionState(StrEnum):
         return MEANINGS[self]
 
     def meaning_dict(self) -> dict[str, Any]:
-        """Return the meaning, as in a snapshot under "state_is"."""
+        """Return the meaning of the state as a map, which is the entry "state_is" of a snapshot."""
         return self.meaning.to_dict()
 
     @classmethod

@@ -283,7 +283,10 @@ class SharedState:
         return int(self._release[0])
 
     def request_release(self) -> None:
-        """Request a release of the latch; the guard clears latch and flag. For the coordinator only."""
+        """Request a release of the e-stop. The guard then clears the latch on disk and the e-stop flag.
+
+        Only the coordinator may call this.
+        """
         self._release[0] = self.releases + 1
         self._wake("guard")
 

@@ -311,8 +311,10 @@ def _carrier_chain(group: Group) -> ChainSequence:
 
 
 def _lengths(arms: Records) -> tuple[int, int, int]:
-    """Return the lengths in the arms' records: joints of their own chains, joints of their carriers, and driving
-    numbers.
+    """Return the three lengths of the arms' records.
+
+    A record has room for this many joints of the arm's own chain, joints of the arm's carrier, and values in the
+    robot's vector that drive these joints.
     """
     return (
         arms["own"]["drive"].shape[1],

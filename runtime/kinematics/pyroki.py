@@ -1,7 +1,7 @@
-"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), which solves the same problem in JAX, for its users.
+"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), for users of PyRoki.
 
-PyRoki is on no package index: install it and jaxls from their repositories. They are imported only if a deployment
-selects this kind.
+It solves the same problem as the default backend, but in JAX. PyRoki is on no package index: install it and jaxls from
+their repositories. They are imported only if a deployment selects this kind.
 """
 
 from __future__ import annotations
@@ -252,9 +252,10 @@ def _variable_of(libraries: _Libraries, size: int) -> Any:
 
 @functools.cache  # cache: to compile it takes longer than a thousand chunks
 def _scan_of(libraries: _Libraries, config: Config) -> Any:
-    """Return the function that computes joints and their bounds for an arm, and the poses and bounds of a chunk.
+    """Return a function that computes joints and their bounds from an arm and from the poses and bounds of a chunk.
 
-    It is compiled with the first arm of each number of joints, which takes longer than a thousand chunks.
+    The function is compiled when it is called with the first arm that has a given number of joints. The compilation
+    takes longer than a thousand chunks.
     """
     jax, jaxlie, jaxls = libraries.jax, libraries.jaxlie, libraries.jaxls
     jnp = jax.numpy

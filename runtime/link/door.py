@@ -279,9 +279,9 @@ class Door:
         return Arrival(route, peer.key, message, parts)
 
     def _named(self, route: bytes, frame: zmq.Frame) -> Peer | None:
-        """Return the peer whose first message on connection `route` this is.
+        """Return the peer at the other end of connection `route`, whose first message is in `frame`.
 
-        None if the connection has ended or was cut off.
+        The result is None if the connection has ended or was cut off.
         """
         try:
             descriptor, key = int(frame.get(zmq.SRCFD)), str(frame["User-Id"])

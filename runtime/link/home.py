@@ -89,7 +89,11 @@ class Home:
         return max(due, key=self._closed.__getitem__) if due else self._removable(now)
 
     def next_labels(self) -> tuple[str, bytes] | None:
-        """Return uuid and label lines of an episode that the lab has with older labels; None if there is none."""
+        """Return uuid and label lines of an episode whose labels at the lab are out of date.
+
+        The lab has the episode, but its labels are older than those here. The result is None if there is no such
+        episode.
+        """
         folder, now = self._data / LABELS, self._clock()
         try:
             files = list(os.scandir(folder))

@@ -93,7 +93,7 @@ class Incoming:
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def handle(self, station: str, route: bytes, message: Message, part: bytes) -> None:
-        """Queue a station's message about an episode for its thread."""
+        """Pass a station's message about an episode to the thread of that station."""
         if station not in self._desks:
             self._desks[station] = _Desk(Shelf(self._data, station, self._owner, self._reserve), self._send)
         self._desks[station].put(route, message, part)
@@ -419,7 +419,10 @@ class Shelf:
         return Declined(episode, reason[:500], again_s)
 
     def _request_reconcile(self, episode: str) -> None:
-        """Create the mark by which a worker writes the episode's rows to the database."""
+        """Mark the episode as arrived, by a file in the folder ARRIVALS.
+
+        A worker that finds the mark writes the episode's rows to the database.
+        """
         folder = self._data / ARRIVALS
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / episode, self.station.encode())

@@ -155,7 +155,10 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """Labels of the episode at the station; the part that follows has the lines of their file."""
+    """Message with the labels of an episode that is at the station.
+
+    The part that follows the message contains the lines of the episode's label file.
+    """
 
     episode: str
 

@@ -53,8 +53,8 @@ class PlacedChunk:
 class Fade:
     """Transition from outgoing actions to the plan, from step `first` on.
 
-    `rows` float64 [L, D] are the outgoing actions, `contributions` those of each row, and `weights` [L] the weight of
-    each row in the blend with the plan.
+    `rows` float64 [L, D] are the outgoing actions, and `contributions` has the contributions of each of them. `weights`
+    [L] has the weight of each outgoing action in the blend with the plan.
     """
 
     first: int
@@ -80,7 +80,8 @@ class Timeline:
 
     The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as a fade is
     active. A chunk merged in that time changes the plan, and the fade continues over the new plan. `laid` are the
-    chunks on the timeline that a strategy still needs for averaging. A new plan discards all steps before its first.
+    chunks on the timeline that a strategy still needs for averaging. A new plan discards all steps before the new
+    plan's first step.
     """
 
     def __init__(self, dim: int) -> None:

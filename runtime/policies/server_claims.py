@@ -43,7 +43,11 @@ _COMPARED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class DeclaredPolicy:
-    """Statements of the deployment about a policy: its requests and the rows of its responses (`rate` in Hz)."""
+    """Properties of a policy as the deployment declares them.
+
+    They are the settings of its requests, and the format of the rows in its responses. `rate` is the rate of these rows
+    [Hz].
+    """
 
     request: RequestSettings
     space: Space

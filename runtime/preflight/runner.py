@@ -114,9 +114,10 @@ class PreflightRunner:
 
     @property
     def _call(self) -> str:
-        """Name of the policy's call that has not returned, for `stage_of`.
+        """Name of the call to the policy that has not returned yet, as `stage_of` expects it.
 
-        If there is none: "connect" until the first response, "" from then on and without a policy.
+        If all calls have returned, the name is "connect" until the policy has responded for the first time, and ""
+        after that. Without a policy the name is "".
         """
         policy = self._policy
         if policy is None:

@@ -153,7 +153,10 @@ class RunCollector:
         self._open: FrameRun | None = None
 
     def add(self, first: int, marked: NDArray[np.bool_], values: ArrayLike | None = None) -> None:
-        """Add frames from `first` on; `marked` have the finding, `values` is its degree per frame (larger is worse)."""
+        """Add frames from the index `first` on.
+
+        `marked` is True for the frames that have the finding. `values` states how bad each frame is; larger is worse.
+        """
         frames = np.flatnonzero(marked)
         if not len(frames):
             if self._open is not None and first + len(marked) - self._open.last > self._apart + 1:

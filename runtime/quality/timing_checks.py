@@ -77,9 +77,10 @@ class TimingCheck:
             self._mark("gap", name, block, gaps > bound + 1e-9, gaps)
 
     def _forwards(self, block: Block, name: str, times: Float64, *, again: bool) -> Float64:
-        """Return the step of each time from the last known time before it [s], [N].
+        """Return the differences [s] between each time and the last known time before it, [N].
 
-        A negative step is flagged, and also a step of zero unless `again`.
+        A negative difference is flagged. A difference of zero is flagged unless `again` is True, which permits the same
+        time again.
         """
         finite = np.isfinite(times)
         steps = np.full(len(times), np.nan)

@@ -44,7 +44,10 @@ def admit_row(layout: Layout, row: Row, expected: int) -> Row:
 
 
 def admit_tick(layout: Layout, tick: ExecutedTick) -> ExecutedTick:
-    """Return a copy of `tick`. Raises RecordingError for a wrong width, or if chunks and weights do not pair."""
+    """Return a copy of `tick`.
+
+    Raises RecordingError if a vector has a wrong width, or if the numbers of chunks and weights in the tick differ.
+    """
     name = f"tick {tick.step}"
     if len(tick.chunk_ids) != len(tick.weights):
         raise RecordingError(

@@ -23,10 +23,11 @@ class Picture(NamedTuple):
 
 
 def encode_count(repeats: int) -> int:
-    """Return how many of `repeats` successive repeats must be encoded; the remaining frames are copies of encoded ones.
+    """Return how many of `repeats` successive repeats must be encoded; the other repeats are copies of encoded frames.
 
-    Fewer than RUN repeats are all encoded. Otherwise two key frames are encoded, of which copies are appended
-    alternately and in pairs; if `repeats` is odd, one more repeat is encoded before them.
+    Fewer than RUN repeats are all encoded. Otherwise two key frames are encoded, and all further repeats are copies of
+    these two in turn. Such copies are always appended in pairs, so if `repeats` is odd, one more repeat is encoded
+    before the two key frames.
     """
     return repeats if repeats < RUN else 2 + repeats % 2
 

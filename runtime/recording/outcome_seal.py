@@ -82,7 +82,7 @@ def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
 
 
 def without_digests(outcome: Mapping[str, object]) -> dict[str, object]:
-    """Return an outcome without its digests, for copies of it elsewhere."""
+    """Return an outcome without its digests and seal, for places outside outcome.json that contain the outcome too."""
     return {name: value for name, value in outcome.items() if name not in (COPY, DIGESTS, SEAL)}
 
 

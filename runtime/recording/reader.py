@@ -83,9 +83,9 @@ class EventsRead:
 
 
 def read_events(path: Path) -> EventsRead:
-    """Return all whole events of the log, lines that are one JSON object; an absent log has none.
+    """Return all complete events of an event log; a complete event is a line that is one JSON object.
 
-    Raises RecordingError if the log cannot be read.
+    If the log does not exist, there are no events. Raises RecordingError if the log cannot be read.
     """
     try:
         data = path.read_bytes()

@@ -48,9 +48,10 @@ class Schema:
         return self.columns is None or column in self.columns
 
     def streams(self, *, qvel: bool, effort: bool, posed: bool) -> dict[str, bool]:
-        """Return for each vector besides joints and actions whether it is recorded.
+        """Return whether each vector stream is recorded, for all vector streams other than joints and actions.
 
-        `qvel`, `effort` and `posed` (it has arms) state whether the robot has such vectors.
+        `qvel` and `effort` state whether the robot reports velocities and efforts. `posed` states whether it has arms,
+        and therefore poses.
         """
         available = {"qvel": qvel, "effort": effort, "eef": posed, "eef_action": posed}
         return {name: has and self.records_column(name) for name, has in available.items()}

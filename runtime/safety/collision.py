@@ -49,7 +49,7 @@ class Collisions:
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 
     def nearest(self, q: Float64) -> Collision | None:
-        """Return the closest pair within the margin, None if no pair is."""
+        """Return the closest of the pairs that are within the margin, None if there is no such pair."""
         apart = self._clearance.distances(q)
         return self._worst(apart, apart < self._least)
 

@@ -127,9 +127,9 @@ class CommandGate:
         return True
 
     def _switch(self, word: str, message: dict[Any, Any]) -> AcceptedCommand | None:
-        """Return the switch of the drives that any client may send, None if the message is malformed.
+        """Return the command to switch the drives on or off, None if the message is malformed.
 
-        Operators at the robot send it, so the master does not change.
+        Any client may send this command. Operators at the robot send it, so the sender does not become the master.
         """
         switch = drives.parse_switch(word, message)
         if switch is None:

@@ -2,7 +2,8 @@
 
 It replaces the drivers of a robot, with rospy and its own messages; a ROS master has to run. It publishes joints and
 camera images and follows commands until they stop for longer than the deadline. Topics are those of the robot's
-description; for a robot without them /GROUP/joint_states, /GROUP/command and /CAMERA/image_raw/compressed.
+description. If the description names none, they are /GROUP/joint_states, /GROUP/command and
+/CAMERA/image_raw/compressed.
 """
 
 from __future__ import annotations

@@ -189,8 +189,9 @@ class ActionSpaces(EndEffectors):
     def _absolute_poses(
         self, rows: Float64, layout: PoseRows, chunk: ActionChunk, observation: Observation
     ) -> Float64:
-        """Return absolute vectors in each arm's own frame, followed by the joints after the poses: [H, 8 * arms
-        + n].
+        """Return rows [H, 8 * arms + n]: absolute arm vectors in each arm's own frame, then n absolute joint values.
+
+        The joint values are those that follow the poses in each row.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         vectors, joints = layout.decode(rows)
@@ -293,8 +294,9 @@ class ActionSpaces(EndEffectors):
         return ChunkStart(on_branch(onset.commanded), on_branch(onset.previous_command), onset.first_row)
 
     def _unwrapped(self, rows: Float64, qpos: Float64, dims: NDArray[np.intp]) -> Float64:
-        """Return rows of the joints `dims` without jumps in joints without limits, which start within half a turn of
-        `qpos`.
+        """Return `rows` of the joints `dims`, changed so that joints without limits do not jump between rows.
+
+        The first row of such a joint is within half a turn of `qpos`.
         """
         endless = np.flatnonzero(np.isin(dims, self._wrapping))
         turning = np.concatenate([qpos[dims[endless]][None], rows[:, endless]])

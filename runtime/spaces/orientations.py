@@ -230,10 +230,11 @@ def _directions(vectors: Float64, otherwise: list[float]) -> tuple[Float64, Bool
 
 
 def _nearest_turns(before: Float64, axis: Float64, angle: Float64) -> Float64:
-    """Return the whole turns about `axis` [arms, 3] that bring rotation vectors of `angle` [arms, 1] closest to
-    `before`.
+    """Return the whole turns to add to rotation vectors so that they are as close as possible to `before`.
 
-    If there is no axis, because the rotation is zero, the whole turns of `before` are repeated.
+    The rotation vectors are given by their unit `axis` [arms, 3] and `angle` [arms, 1]; `before` [arms, 3] are the
+    previous rotation vectors. A whole turn is a vector of length 2 pi along the axis. If a rotation is zero and
+    therefore has no axis, the whole turns that `before` contains are repeated.
     """
     along = np.sum(before * axis, axis=-1, keepdims=True)
     length = np.linalg.norm(before, axis=-1, keepdims=True)

@@ -44,7 +44,11 @@ def to_absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: Relat
 
 
 def relative(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
-    """Return absolute `vectors` (unit quaternions) relative to `start` [arms, 8]; the inverse of `to_absolute`."""
+    """Convert absolute `vectors` (unit quaternions) to the action mode `mode`; the inverse of `to_absolute`.
+
+    In mode "absolute" they are returned unchanged. In mode "delta" each row is relative to the row before it, and the
+    first to `start` [arms, 8]. In other modes all rows are relative to `start`. `frame` states about which axes.
+    """
     if mode == "absolute":
         return vectors
     before = np.broadcast_to(start, vectors.shape)

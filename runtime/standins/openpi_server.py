@@ -113,8 +113,8 @@ class OpenpiServer(WebsocketServer):
     def _took(self, started: float) -> float:
         """Return the duration [s] of an answer that was begun at `started` [s].
 
-        It is the declared latency; if none is declared, wait until the latency has passed and return the measured
-        duration.
+        If the server only declares its latency, the configured latency is returned at once. Otherwise this waits until
+        the latency has passed since `started`, and returns the measured duration.
         """
         if self._behaviour.declared:
             return self._behaviour.latency

@@ -85,7 +85,10 @@ class RoboarenaServer(WebsocketServer):
         return address | {"url": f"{address['url']}{path}"}
 
     def serves_path(self, path: str) -> bool:
-        """Return True if a policy is served at this path: at any path as RoboArena, at a single path as vLLM-Omni."""
+        """Return True if a policy is served at the URL path `path`.
+
+        The variant RoboArena serves the policy at every path, the variant vLLM-Omni only at VLLM_PATH.
+        """
         return self._arena.variant == "roboarena" or path == VLLM_PATH
 
     def greeting(self) -> Frames | None:

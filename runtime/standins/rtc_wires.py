@@ -81,7 +81,8 @@ class NoRtcWire(Wire):
 class PrevActionWire(NoRtcWire):
     """Format with RTC keys in the observation.
 
-    The request does not state a delay; the answer repeats as many rows as the robot consumed of the previous chunk.
+    A request states how many rows of the previous chunk the robot has consumed, but no delay. The stand-in uses the
+    number of consumed rows as the delay: the answer begins with that many rows of the rest of the previous chunk.
     """
 
     def metadata(self) -> dict[str, object]:

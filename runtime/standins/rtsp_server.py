@@ -128,7 +128,10 @@ class RtspServer(CameraServer):
 
 
 def _payloads(unit: bytes, last: bool) -> Iterator[tuple[bytes, bool]]:
-    """Yield the payloads that carry one NAL unit, whole or in fragments (FU-A), each with whether it ends an image."""
+    """Yield pairs (payload, whether it ends an image) that together carry one NAL unit.
+
+    A unit is sent whole or, if it is too large, in fragments (FU-A). `last` is True for the last unit of an image.
+    """
     if len(unit) <= _LARGEST:
         yield unit, last
         return

@@ -266,7 +266,7 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
 
 
 def _length(text: str) -> float:
-    """Parse a length of 0 to 100 mm."""
+    """Return the length [mm] that `text` states; it must be from 0 to 100."""
     return _number(text, 100.0)
 
 

@@ -28,10 +28,10 @@ CAPABILITIES = TypeAdapter(Capabilities)
 
 @dataclass(frozen=True, slots=True)
 class StationSpec:
-    """Deployment with its robot and everything known of both before connecting; plain values.
+    """Deployment with its robot, and what is known about both before anything is connected.
 
-    If `collecting`, the station is set up to collect demonstrations, and the leader in the deployment's [collection]
-    takes the place of the policy.
+    All attributes are plain values. If `collecting`, the station is set up to collect demonstrations, and the leader in
+    the deployment's [collection] takes the place of the policy.
     """
 
     resolved: Resolved

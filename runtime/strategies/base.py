@@ -77,9 +77,10 @@ class ArrivedChunk:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Rows of a chunk that are used, [N, D]; row 0 is for step `first`; empty if the chunk is dropped.
+    """Part of a chunk that is used: `rows` [N, D], of which row 0 is for step `first`.
 
-    `before` [D] is the row of the chunk that precedes them, None if there is none.
+    `rows` is empty if the chunk is dropped. `before` [D] is the chunk's row that directly precedes `rows`, None if
+    there is no such row.
     """
 
     rows: Float64

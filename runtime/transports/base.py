@@ -89,9 +89,10 @@ class Sink(ABC):
         raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Return the reason ("" if unknown) by command topic without a subscriber; {} if the transport cannot tell.
+        """Return the command topics that have no subscriber, each with the reason ("" if the reason is unknown).
 
-        Sends no request and does not block. Raises TransportError.
+        The result is {} if the transport cannot tell. This method sends no request and does not block. Raises
+        TransportError.
         """
         return {}
 

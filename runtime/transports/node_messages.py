@@ -1,5 +1,6 @@
-"""Messages of an execution node, checked against the robot; an invalid message is refused under the name of its
-fault.
+"""Messages of an execution node, checked against the robot.
+
+An invalid message is refused. The error has the name of the fault under which such messages are counted.
 """
 
 from __future__ import annotations

@@ -308,7 +308,10 @@ class NodeSource(Source):
         return True
 
     def _ignore_truth(self) -> None:
-        """Count one fault, however many messages contain a ground truth: every message of such a node does."""
+        """Count a fault for ground truth that the deployment does not declare, but only once.
+
+        Every message of such a node contains ground truth, so that a count per message would say nothing.
+        """
         if "truth_ignored" not in self._faults:
             text = _TRUTH_UNDECLARED
             self._count_fault("truth_ignored", text)

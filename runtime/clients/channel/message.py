@@ -69,7 +69,10 @@ def read(frames: list[bytes]) -> Message:
 
 
 def _press(message: Mapping[str, Any]) -> Message:
-    """Return the press of the e-stop in `message`; its invalid fields are ignored, and `arguments` has the reason."""
+    """Return the e-stop press in `message`.
+
+    Invalid fields of the message are ignored. The `arguments` of the result contain the reason of the press.
+    """
     form: Literal["cmd", "command"] = "cmd" if isinstance(message.get("cmd"), str) else "command"
     word = message.get(form)
     named = word if isinstance(word, str) else pressing.NAME

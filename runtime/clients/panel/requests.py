@@ -1,14 +1,14 @@
 """Requests to the panel: who may send them, and their answers.
 
-| request | PIN |
+| request | needs the PIN |
 |---|---|
 | GET / and the files that it loads | no |
 | POST /estop | no |
-| POST /pin, POST /leave | |
+| POST /pin, which sends the PIN; POST /leave, which ends the access that the PIN gave | no |
 | GET /state, GET /camera/NAME; POST /stop | yes |
 
-A request for a host other than the panel's names is refused (DNS rebinding). So is a POST from another origin, and one
-without an Origin unless it has our header, which a page of another origin cannot send (CSRF).
+A request for a host other than the panel's names is refused (DNS rebinding). A POST from another origin is refused,
+too. A POST without an Origin is refused unless it has our header, which a page of another origin cannot send (CSRF).
 """
 
 from __future__ import annotations

@@ -50,7 +50,10 @@ _ELSEWHERE = "the console and the station's log say why"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Newest image of a camera, JPEG, numbered from 1."""
+    """Newest image of a camera.
+
+    `jpeg` is the encoded image. `number` counts the images of the camera from 1.
+    """
 
     number: int
     jpeg: bytes

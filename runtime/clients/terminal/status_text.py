@@ -86,7 +86,10 @@ def _lease(lease: Mapping[str, Any], me: str) -> str:
 
 
 def drive_line(said: Mapping[str, Any]) -> str:
-    """Return a line about the state of the drives as the execution node reports it; `said` is empty if it does not."""
+    """Return a line about the state of the drives.
+
+    `said` is the state as the execution node reports it, and is empty if the node does not report it.
+    """
     if not said:
         return "not reported by the node"
     faults = "".join(f"; fault: {fault}" for fault in said["faults"])

@@ -211,8 +211,10 @@ def _set_start(going: bool, frame: Record) -> None:
 
 @device_function
 def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> None:
-    """Set start and rest position to the joints closest to the guide's row that are within reach of the previous
-    frame.
+    """Set the start and the rest position of a frame to joints that follow the guide's row `row`.
+
+    They are as close to the guide as possible, but within the limits, and within the distance from the previous frame
+    that the joints may travel in `dt` [s].
     """
     for i in range(arm.joints):
         reach = _GUIDED * arm.speed[i] * dt
@@ -225,7 +227,8 @@ def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Recor
 def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Float64) -> None:
     """Write to `goal` [12] the target pose relative to the base of the arm's own chain.
 
-    That base is the last frame of the carrier's frames `carried`.
+    `carried` has the frames of the carrier, i.e. of the chain that carries the arm, in sequence. The last of them is
+    the base of the arm's own chain.
     """
     base = len(carried) - 1
     matrix = matrix_of(

@@ -19,8 +19,10 @@ _FAST = {"contract", "nsz"}  # fused multiply-add; no reordering, which would sp
 
 
 def kernel(loop: Loop) -> Loop:
-    """Compile a loop that Python calls, at its first call with each set of types; cached on disk if a folder is
-    writable.
+    """Return the compiled form of a loop that Python calls.
+
+    The loop is compiled at its first call with each combination of argument types. The result is cached on disk if
+    there is a writable folder for the cache.
     """
     compiled = numba.njit(cache=CACHE is not None, nogil=True, fastmath=_FAST, error_model="numpy")(loop)
     return cast(Loop, compiled)

@@ -42,7 +42,9 @@ class Cameras:
         self._numbering: Numbering = numbering
 
     def assign(self, wants: ServerRequirements) -> dict[str, str]:
-        """Return the observation key by request key for the views that the server needs, in the server's order.
+        """Return the observation key for each request key of the views that the server needs.
+
+        The result is in the order of the protocol's messages.
 
         Cameras for other views are not sent. Raises ContradictionError if no camera is declared for a needed view.
         """

@@ -104,7 +104,10 @@ class ArenaRequest:
 
     @property
     def glances_s(self) -> float | None:
-        """Period at which pictures are stored [s]; None if requests have no earlier pictures."""
+        """Period [s] at which pictures are stored for later requests.
+
+        It is None if requests contain only the pictures of the present observation.
+        """
         return None if self._history is None else 1.0 / self._settings.frame_rate
 
     def observe(self, observation: Observation) -> None:

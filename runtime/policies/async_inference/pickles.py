@@ -111,7 +111,8 @@ class _Record:
 class _Name:
     """Class or function that a pickle names; its attributes are read-only.
 
-    `make` is the function of ours that is called in its place, None if calling it is refused.
+    `make` is the function of this program that is called in place of the named one. It is None if the pickle may not
+    call this name.
     """
 
     __slots__ = ("make", "what")

@@ -1,4 +1,7 @@
-"""Requests to LeRobot's policy server, the model that it is to load, and its responses as rows."""
+"""Messages for LeRobot's policy server, as a deployment declares them.
+
+The module builds the request to load a model and the requests with observations, and converts responses to rows.
+"""
 
 from __future__ import annotations
 

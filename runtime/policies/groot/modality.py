@@ -93,7 +93,10 @@ def parse_modalities(reply: object) -> Modalities:
 
 
 def _contract(contract: Mapping[str, Any]) -> Modalities:
-    """Return modalities from flat lists of keys; everything that the server does not state follows the deployment."""
+    """Return the modalities of a server that answers with flat lists of keys (StarVLA).
+
+    `contract` is that answer. For everything that it does not state, the deployment's declarations are used.
+    """
     horizon: Any = contract.get("action_horizon")
     rows = horizon if type(horizon) is int and 0 < horizon <= _MOST_ROWS else 1
     return Modalities(
@@ -169,7 +172,10 @@ def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
 
 
 def _enum_name(value: object) -> str:
-    """Return the name of an enumeration member, which servers state by its name or its value."""
+    """Return the name of an enumeration member, in capitals.
+
+    Servers send either the member's name or its value, which differ in spelling.
+    """
     return str(value).upper().replace("+", "_")
 
 

@@ -1,4 +1,4 @@
-"""ZMQ REQ socket with a deadline for every wait, which is replaced after a lost reply."""
+"""ZMQ REQ socket with a deadline for every wait. After a lost reply the socket is replaced by a new one."""
 
 from __future__ import annotations
 

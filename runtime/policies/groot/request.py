@@ -1,4 +1,7 @@
-"""GR00T requests from observations, and rows of actions from responses, by maps that a deployment declares."""
+"""Conversion of observations to GR00T requests, and of GR00T responses to rows of actions.
+
+The deployment declares which key of the model has which content.
+"""
 
 from __future__ import annotations
 

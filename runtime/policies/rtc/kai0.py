@@ -1,8 +1,9 @@
 """Dialect of kai0, with flat keys: the previous chunk as nested lists, the predicted delay, the end of the transition.
 
-The server compares row n of that chunk with row n of the new chunk, so the chunk must begin at the first row that the
-robot has not consumed. kai0's own client sends the whole chunk as received, which is right only if nothing was
-consumed; with `rows` = "whole" this dialect does the same. Rows contain the robot's values, never the model's own.
+The server compares row n of the previous chunk with row n of the new chunk, so the previous chunk must begin at the
+first row that the robot has not consumed. kai0's own client sends the whole chunk as received, which is right only if
+nothing was consumed; with `rows` = "whole" this dialect does the same. Rows contain the robot's values, never the
+model's own.
 """
 
 from __future__ import annotations

@@ -28,7 +28,10 @@ class PrevAction(Dialect):
         return None if declared is None else bool(declared["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """Return the observation with both keys, or the observation itself without conditioning."""
+        """Return the observation with the keys `prev_action` and `rtc_params`.
+
+        Without conditioning the observation itself is returned.
+        """
         if conditioning is None:
             return observation
         return observation | {

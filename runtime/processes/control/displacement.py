@@ -191,10 +191,10 @@ class DisplacementMonitor:
 
     @property
     def speed(self) -> Float64:
-        """Velocity limit with which the command converges to the measured joints [D].
+        """Velocity limits with which the command converges to the measured joints [D].
 
-        For joints that converge without rests it is their full velocity limit, for all other joints the limit of
-        generated motions.
+        Some joints converge in a single motion, without the rests of `Led`. Their limit is the joint's full velocity
+        limit. The limit of all other joints is that of generated motions.
         """
         whole = False if self._meeting or self._led is None else self._led.whole
         return self._settings.limits.velocity * np.where(

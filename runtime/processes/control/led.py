@@ -1,4 +1,4 @@
-"""Convergence of a command to the measured joints, in parts that reveal an encoder with an offset."""
+"""Convergence of a command to the measured joints in several motions, which reveal an encoder with an offset."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _THERE = 1e-6
 class Led:
     """Convergence of a command to the measured joints, in parts with a rest after each, until two parts agree.
 
-    It distinguishes a joint that is moved by hand from a joint whose encoder has an offset. The readings of a joint
-    moved by hand do not depend on the command. The readings of an encoder with an offset follow the command, and rest
-    (or drift on) when the command rests.
+    A part is a motion of the command by at most PART. The comparison of parts distinguishes a joint that is moved by
+    hand from a joint whose encoder has an offset. The readings of a joint moved by hand do not depend on the command.
+    The readings of an encoder with an offset follow the command, and rest (or drift on) when the command rests.
 
     For each part, the motion of the readings is compared with the motion that their speed before and after the part
     explains. If in two parts the readings moved with the command by more than that, and the excess is more than half of
@@ -74,20 +74,27 @@ class Led:
 
     @property
     def whole(self) -> np.ndarray:
-        """Joints that converge the remaining distance without a rest, bool [D]."""
+        """Joints that converge the remaining distance in a single motion, without rests, bool [D]."""
         return np.asarray(self.at_once | self.alone)
 
     def end(self, goal: Float64) -> Float64:
-        """Return the farthest command [D] towards `goal` [D] that is allowed in the present part."""
+        """Return the command [D] at which the present part ends: as close to `goal` [D] as this part may come."""
         return np.where(self.whole, goal, np.clip(goal, self._from - PART, self._from + PART))
 
     def update(
         self, commanded: Float64, measured: Float64, goal: Float64, speed: Float64, now: float
     ) -> np.ndarray:
-        """Evaluate the readings after each part and its rest; return the joints that moved with the command, bool [D].
+        """Evaluate the readings once a part and the rest after it have ended.
 
-        A joint is among them as soon as it moved with the command in enough parts, including those of earlier
-        convergences.
+        Return the joints whose readings moved with the command, bool [D]. A joint is among them as soon as this was so
+        in enough parts. Parts of earlier convergences count too.
+
+        Args:
+            commanded: Present command [D].
+            measured: Present readings [D].
+            goal: End of the convergence [D].
+            speed: Present velocity of the readings [D].
+            now: Present time [s].
         """
         off = np.asarray(self.along >= _SAY)
         if np.abs(self.end(goal) - commanded).max(where=~self.whole, initial=0.0) > _THERE:

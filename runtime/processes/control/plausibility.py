@@ -158,15 +158,19 @@ class JointPlausibility:
         return self._chain is not None and not self._doubt and bool(self._chain.recent(self._needed))
 
     def is_displaced(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
-        """Return True if all samples that must agree are farther than `allowed` ([rad] or [D]) from `held` [D].
+        """Return True if the robot is farther than `allowed` ([rad] or [D]) from the position `held` [D].
 
-        The joints `but`, bool [D], are ignored.
+        This must be so in all of the newest samples over the time for which samples must agree to be trusted. The
+        result is False if the samples are doubtful or too few. The joints in `but`, bool [D], are ignored.
         """
         lately = self._chain.recent(self._needed) if self._chain and not self._doubt else []
         return bool(lately) and all(self._away(sample.joints, held, allowed, but) for sample in lately)
 
     def pop_outage(self) -> float:
-        """Return the duration of the outage before the trusted joints [s]; 0 on the second call."""
+        """Return the duration [s] of the outage after which the present samples became trusted, and forget it.
+
+        The result is 0 if no samples are trusted, if there was no outage, or if its duration was returned before.
+        """
         missing, self._missing = (0.0 if self._chain is None else self._missing), 0.0
         return missing
 

@@ -72,8 +72,9 @@ class SteadyError:
     def unchanged_joints(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
         """Return the joints whose command a stop does not change, bool [D].
 
-        Either their error is steady, or the command has been constant for so long that the cause of a displacement is
-        unknown, for example a slipped encoder: `DisplacementMonitor` handles these.
+        A joint is among them for one of two reasons. Either its error is steady, or its command has been constant for
+        so long that the cause of a displacement is unknown, for example a slipped encoder. `DisplacementMonitor`
+        handles such displacements.
         """
         if self._inherited:
             error = self._error(robot, measured)

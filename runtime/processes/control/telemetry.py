@@ -130,7 +130,10 @@ class Telemetry:
         self._step, self.planned, self._woke = step, planned, woke
 
     def emit(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
-        """Queue an event for the end of the tick, with the number of the order in force."""
+        """Queue an event, which is sent at the end of the tick.
+
+        The event contains the number of the newest order of the coordinator that control has obeyed.
+        """
         self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
     def add_merge(self, merged: MergeResult) -> None:

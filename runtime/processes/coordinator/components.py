@@ -65,7 +65,7 @@ class Components(ABC):
 
     @abstractmethod
     def record_event(self, event: Event) -> None:
-        """Publish an event of another process, which writes it to the episode itself."""
+        """Publish an event that another process has emitted. That process writes the event to the episode itself."""
 
     @abstractmethod
     def handle_event(self, happening: SessionEvent, reason: str, process: str = "") -> None:

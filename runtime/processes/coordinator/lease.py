@@ -103,7 +103,10 @@ class Lease:
         return refusal
 
     def hide(self, holder: str, epoch: int, now: float) -> None:
-        """Record that the holder's page is hidden: the lease is not extended, and its expiry is no loss."""
+        """Record that the holder's page is hidden.
+
+        The lease is not extended by this. When it expires, this does not count as a loss of the holder.
+        """
         if not self.check(holder, epoch, now) and self._held:
             self._held = replace(self._held, hidden=True)
 

@@ -315,7 +315,8 @@ class SessionActions:
     def approach(self) -> None:
         """Move on a limited path to the policy's first action.
 
-        During a run that is the start of the proposal, otherwise the first action that the last set-up found.
+        If a proposal is shown during a run, this is the start of the proposal. Otherwise it is the first action that
+        the last set-up found.
         """
         proposal, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and proposal is not None:

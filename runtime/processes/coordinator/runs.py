@@ -339,7 +339,10 @@ class Runs:
         return EndEpisode(status, reason, {"control": self._figures()})
 
     def interrupt_standalone_recording(self, reason: str) -> None:
-        """Close a standalone recording as interrupted, if one is open; media may hang."""
+        """Close a standalone recording as interrupted, if one is open.
+
+        This also works if media hangs: the message to media is then lost, which is logged.
+        """
         if self._alone:
             self.record_event(self._end_alone("interrupted", reason))
             self._alone = ""

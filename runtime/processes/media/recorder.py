@@ -87,7 +87,7 @@ class Recorder:
     def begin(self, manifest: Mapping[str, Any], run: int) -> tuple[str, Path]:
         """Open an episode and return its uuid and folder. Raises RecordingError.
 
-        With `run` 0 it records every tick, else only those of that run.
+        If `run` is 0, the episode records every tick, otherwise only the ticks of the run with that number.
         """
         if self._uuid:
             raise RecordingError(_EPISODE_OPEN(episode=self._uuid))

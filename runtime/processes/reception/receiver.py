@@ -1,4 +1,7 @@
-"""Receiver of observations into shared state, with their rates, faults, ages, drives and ground truth."""
+"""Receiver that puts observations into shared state.
+
+It also provides rates, fault counts and ages of the observations, the state of the drives, and the ground truth.
+"""
 
 from __future__ import annotations
 

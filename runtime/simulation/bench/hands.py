@@ -68,7 +68,7 @@ class Jaws:
         return Hand(self.name, tip, opening, travel / seconds if seconds > 0 else 0.0)
 
     def stop(self, q: Float64, opening: float) -> None:
-        """Set the gripper's value in q [D] so that the jaws are `opening` [m] apart."""
+        """Stop the gripper where the jaws are `opening` [m] apart: set the gripper's value in `q` [D] in place."""
         q[self._dim] = self._opening.number(opening)
 
 

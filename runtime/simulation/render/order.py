@@ -16,10 +16,11 @@ Bool = NDArray[np.bool_]
 
 
 class Order:
-    """Separating sides of solids at their present poses; `hides` evaluates them for a viewpoint.
+    """Drawing order of solids at their present poses.
 
-    Each solid is in a box with three unit axes, which are the rows of `axes` [S, 3, 3]; `centres` and `halves` [S, 3]
-    are the boxes' centres and half sizes.
+    For each pair of solids, the side of a box that separates the two best is found once. `hides` then evaluates these
+    sides for a viewpoint. Each solid is in a box with three unit axes, which are the rows of `axes` [S, 3, 3];
+    `centres` and `halves` [S, 3] are the boxes' centres and half sizes.
     """
 
     def __init__(self, axes: Float32, centres: Float32, halves: Float32) -> None:

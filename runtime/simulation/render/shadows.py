@@ -58,7 +58,10 @@ class Shadows:
         return np.asarray(cv2.min(blurred, self._plate_map(plate)), np.uint8)
 
     def _plate_map(self, plate: tuple[float, float]) -> UInt8:
-        """Return the map with only the shadow of the plate, which is around it but not on it."""
+        """Return the map that contains only the shadow of the plate.
+
+        The shadow falls on the table around the plate, and not on the plate itself.
+        """
         if self._under_plate is None or self._under_plate[0] != plate:
             shade = np.full(self._shape, 255, np.uint8)
             height, radius = self._bench.plate_height, self._bench.plate_radius

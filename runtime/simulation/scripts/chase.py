@@ -37,7 +37,9 @@ _NODES = (16, 5)  # nodes of the map, along and across the belt
 
 
 class ChaseScript(Script):
-    """Chase policy for all connections; `places` maps the places of the belt to joints.
+    """Script of the chase policy, which all connections share; each connection gets a `ChaseEpisode` of its own.
+
+    `places` maps positions of a block on the belt to joints.
 
     Raises:
         SetupError: If no arm of the robot reaches all of the belt.

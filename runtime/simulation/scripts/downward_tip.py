@@ -17,9 +17,10 @@ Place = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class DownwardTip:
-    """Fingertips above a place at a height [m] that point down, tilted outwards from the arm.
+    """Pose of fingertips that point down, at the height `height` [m] above `place`.
 
-    The tilt is `tilt` [rad] along `bearing` [rad]; the jaws open along `yaw` [rad].
+    The fingers are tilted outwards from the arm by the angle `tilt` [rad], in the direction `bearing` [rad]. The jaws
+    open along the direction `yaw` [rad].
     """
 
     place: Place

@@ -68,7 +68,11 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class PlannedFailure:
-    """Deliberate failure: the jaws close `short` of the block [m], or release it on the way."""
+    """Deliberate failure of a route.
+
+    `short` [m] is the distance by which the arm reaches too short, so that the jaws close before the block. If
+    `lets_go`, the jaws release the block on the way to the plate.
+    """
 
     short: float = 0.0
     lets_go: bool = False
@@ -174,7 +178,12 @@ class RoutePlanner:
     def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: PlannedFailure) -> list[Leg]:
         """Return the legs of a route from joints `q` [D].
 
-        `down` and `over` are joints [stations, D] from the top down to the block and to the plate, both with open jaws.
+        Args:
+            arm: Arm that moves.
+            q: Joints at the start of the route [D].
+            down: Joints [stations, D] on the path down to the block, from the top, with open jaws.
+            over: Joints [stations, D] on the path down to the plate, from the top, with open jaws.
+            slip: Deliberate failure; if it lets go, the jaws open halfway to the plate.
         """
         gripped, lowered = (closed(arm, descent) for descent in (down, over))
         legs = []

@@ -78,9 +78,9 @@ class RosSink(Sink):
             publish(payload)
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Return the command topics without a subscriber, or with one that was refused, and the reason.
+        """Return the command topics that lack a subscriber, each with the reason ("" if the reason is unknown).
 
-        The reason is "" if it is unknown.
+        A topic counts if it has no subscriber at all, or if one of its subscribers was refused.
         """
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}

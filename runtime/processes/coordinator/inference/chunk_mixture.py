@@ -49,7 +49,7 @@ class Mixture:
         self._layout: PoseRows | None = None  # a policy uses a single format
 
     def joints(self, parts: MixtureParts) -> Float64:
-        """Mix joint rows [N, D]; angles without limits are on the branch of the newest row."""
+        """Mix joint rows [N, D]. Angles without limits are within half a turn of the newest row."""
         return _mixed(parts, self._dims.switched, self._dims.wrapping)
 
     def numbers(self, parts: MixtureParts, like: ActionChunk) -> Float64:
@@ -100,8 +100,8 @@ class Mixture:
     def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
         """Return True if the linear mixture `straight` equals `meant` within tolerance.
 
-        `meant` is the mixture as control makes it. They differ, for example, if angles wrap. `like` is a chunk with the
-        same columns.
+        `meant` is the mixture that control makes. The two differ, for example, if angles wrap. `like` is a chunk whose
+        columns are those of both mixtures.
         """
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)

@@ -309,9 +309,9 @@ class Inference:
     def _try_request(self) -> bool:
         """Send a request; return True if its response is available at once.
 
-        If the newest observation is too old, no request is sent and False is returned; an error is raised once this has
+        If the newest observation is too old, no request is sent and False is returned. An error is raised once this has
         lasted longer than permitted. Control also checks the age of observations, but only when it executes an action,
-        and there are none while a strategy waits for this response.
+        and it executes none while a strategy waits for this response.
         """
         now = self._clock.now()
         waited = self._mode in ON_DEMAND or self._strategy.query.requests_while_stopped

@@ -341,7 +341,10 @@ class RtcPrefix:
 
 
 def _source_row_count(commands: int, pace: float) -> int:
-    """Return the number of a policy's rows from which this number of commands was resampled."""
+    """Return the number of policy rows from which `commands` commands were made by resampling.
+
+    `pace` is the number of policy rows per command.
+    """
     return math.ceil((commands - 1) * pace - _HAIR) + 1
 
 

@@ -47,8 +47,9 @@ class Grippers:
     def plan_request(self, request: GripperRequest, commanded: Float64, free: bool) -> GripperPlan:
         """Return new locks and motion for a request; `commanded` [D] is the commanded position.
 
-        If `free`, nothing else moves the arms, and opening or closing is a motion; the lock of a locked gripper moves
-        with it. If not `free`, opening or closing locks the gripper at its open or closed position, without a motion.
+        If `free`, nothing else moves the arms, and opening or closing is a motion. A gripper that was locked is then
+        locked at the end of this motion. If not `free`, opening or closing locks the gripper at its open or closed
+        position, without a motion.
 
         Raises:
             RuntimeFault: the robot has no such gripper.

@@ -99,7 +99,7 @@ class SessionEvent(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class GuardFacts:
-    """Facts for the guards of commands, in addition to the state."""
+    """Facts that decide, in addition to the session's state, whether a command is allowed."""
 
     mode: Mode | None = None  # of the open run
     trial: bool = False  # the open run is a trial: what is measured must not change
