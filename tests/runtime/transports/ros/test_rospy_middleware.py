@@ -304,7 +304,9 @@ def test_a_master_that_dies_and_comes_back_is_registered_with_again(
         say(peer, "/master/state", 0.0)
         matched(made, "/master/state")
         ros.kill()
-        eventually(lambda: any("connections continue" in text for text in caplog.messages), "the master's end")
+        eventually(
+            lambda: any("connections continue" in text for text in caplog.messages), "the master's end"
+        )
         inbox.payloads.clear()
         say(peer, "/master/state", 1.0)  # what is connected goes on
         assert inbox.until()[0].position[0] == 1.0
