@@ -177,7 +177,10 @@ def _presses(running: RunningLab, seconds: float) -> list[Press]:
 
 
 def _presses_here(robot: Path, seconds: float) -> list[float]:
-    """Press at the station's own socket, repeatedly for `seconds`; return the durations [ms]."""
+    """Press the e-stop at the station's own socket, again and again for `seconds`.
+
+    Return the time from each press to its answer [ms].
+    """
     times_ms: list[float] = []
     client = StationClient(robot / "stations" / PRESSED, "benchmark")
     until = time.monotonic() + seconds

@@ -21,7 +21,7 @@ class PreflightStatus(models.TextChoices):
 
 
 class Verdict(models.TextChoices):
-    """Outcomes of a report, as in the runtime, with labels."""
+    """Outcomes of a preflight's report, with labels; they have the same values as in the runtime."""
 
     OK = "ok", "usable"
     MISCONFIGURED = "misconfigured", "the configuration is wrong"

@@ -217,11 +217,10 @@ class Listing:
     def file(
         self, request: HttpRequest, name: str, rows: QuerySet[Any] | Iterable[Any]
     ) -> StreamingHttpResponse:
-        """Return all rows as `name`.csv: a queryset in the order of the list, other rows as they come.
+        """Return all rows as the file `name`.csv: a queryset in the order of the list, other rows as they come.
 
         Raises:
-            EvaError: The request is invalid (`fault`). A page then shows the unfiltered list with the reason; a file
-                could not show the reason.
+            EvaError: The request is invalid; `fault` is the reason.
         """
         if self.fault:
             raise EvaError(self.fault)

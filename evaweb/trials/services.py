@@ -460,7 +460,10 @@ def _reject_repeat(trial: Trial, values: Mapping[str, Any], outcome: ScoredOutco
 
 
 def _require_truth(trial: Trial, outcome: ScoredOutcome) -> None:
-    """Raise EvaError unless the bench's ground truth agrees with a score whose source is declared as that truth."""
+    """Raise EvaError if a score that was declared as the bench's ground truth differs from that ground truth.
+
+    This includes trials for which the bench reported no ground truth.
+    """
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
     for milestone, reached, _ in outcome.reached:

@@ -213,7 +213,11 @@ def _picture(key: str, value: object) -> UInt8:
 
 
 def _truth(name: str, value: object) -> Mapping[str, Any]:
-    """Check the ground truth: JSON with the id of its reset, the milestones since then and the success."""
+    """Return the simulated bench's ground truth after checking it.
+
+    It is JSON with three keys: `reset`, the id of the newest reset; `milestones`, which of them were reached since that
+    reset; and `success`. Raises: MessageRefused if a key is invalid or the whole is too long.
+    """
     try:
         truth: dict[str, Any] = _JSON.validate_python(value)
     except ValidationError as invalid:

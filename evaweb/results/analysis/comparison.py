@@ -1,4 +1,4 @@
-"""Statistics of two checkpoints; each field of `Comparison` declares one."""
+"""Comparison of two checkpoints; each field of the class `Comparison` declares one statistic."""
 
 # ruff: noqa: RUF009 - calls in the body of `Comparison` declare its fields
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Judge behind an HTTP server with the OpenAI-compatible chat format, which is sent images once per trial.
+"""Automatic judge behind an HTTP server with the OpenAI-compatible chat format.
 
-Requests go only to the address in its set-up: redirects are not followed and proxies are not used. Time and size of
-the answer are limited, and an answer in any other than the requested format is no verdict.
+The judge is sent the images of each trial once. Requests go only to the address in its set-up: redirects are not
+followed and proxies are not used. Time and size of the answer are limited. An answer that does not have the requested
+format is no verdict.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class TrackingErrors:
 
     @property
     def mean(self) -> float:
-        """Mean distance [m]; 0 before the first step."""
+        """Mean of all distances so far [m]; 0 before the first step."""
         return self.total / max(1, len(self.distances))
 
     def quantile(self, part: float) -> float:

@@ -286,10 +286,10 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
 def _complete_blocks(
     blocks: Sequence[Block], counts: Sequence[Sequence[int]] | None, sides: tuple[int, int]
 ) -> list[tuple[list[float], list[float]]]:
-    """Return by block the outcomes of both checkpoints in `sides`, ending before the first incomplete block.
+    """Return the outcomes of the two checkpoints in `sides`, one pair of lists per block.
 
-    `counts` has the number of trials of both checkpoints that the schedule has up to the end of each block; None if
-    each block has one trial of each.
+    The first incomplete block and all later ones are left out. `counts` contains, for the end of each block, how many
+    trials of each of the two checkpoints the schedule has up to there. If it is None, each block has one trial of each.
     """
     complete: list[tuple[list[float], list[float]]] = []
     before = [0, 0]

@@ -157,7 +157,9 @@ class SessionMachine:
     def handle_event(self, happening: SessionEvent, reason: str = "") -> bool:
         """Apply an event; return True if the state changed.
 
-        A RuntimeFault of an effect is passed on, with the state unchanged.
+        Raises:
+            RuntimeFault: An action that the event requires, such as holding the robot, failed. The state is then
+            unchanged.
         """
         if happening in _OF_THE_LINK:
             self._connected = happening is SessionEvent.CONNECTED
