@@ -108,15 +108,18 @@ class _Reader(ABC):
 
     def _follow(self, endpoint: str) -> None:
         """Read until the runtime has another address."""
-        received_at = looked = time.monotonic()
+        silent_s = 0.0
+        before = looked = time.monotonic()
         with closing(Subscriber(zmq.Context.instance(), endpoint, *self._streams)) as subscriber:
             while not self._ended.is_set():
                 messages = self._receive(subscriber)
                 now = time.monotonic()
+                # A turn that lasted longer counts as two: this process stood still itself, and heard nobody meanwhile.
+                silent_s = 0.0 if messages else silent_s + min(now - before, 2 * _TURN_S)
+                before = now
                 if messages:
-                    received_at = now
                     self.on_messages(messages)
-                elif now - received_at > _SILENCE_S:
+                elif silent_s > _SILENCE_S:
                     self.on_silence(
                         f"no sign of life from {self._wire.name}: was its runtime ended, or does it hang?"
                     )

@@ -100,9 +100,13 @@ class BenchPage:
         assert answer.ok, answer.text()
         return answer.json()
 
+    def snapshot(self):
+        """The station's newest snapshot; there is none while it has not answered the web in time."""
+        return eventually(lambda: self.api(f"stations/{STATION}")["snapshot"], "the station answers")
+
     def truth(self):
         """What the simulated bench says of itself."""
-        return self.api(f"stations/{STATION}")["snapshot"]["truth"]
+        return self.snapshot()["truth"]
 
     def cameras_live(self):
         """Every camera pane has a picture that is not stale."""

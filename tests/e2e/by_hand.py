@@ -3,7 +3,6 @@
 import pytest
 
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.lab import STATION
 from tests.processes import PATIENCE_S, eventually
 
 MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual": "5"}
@@ -11,9 +10,6 @@ MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual
 
 class DebugPage(BenchPage):
     """Somebody at the Debug tab who uses keys wherever there are some."""
-
-    def snapshot(self):
-        return self.api(f"stations/{STATION}")["snapshot"]
 
     def keys(self, *pressed):
         for key in pressed:

@@ -48,7 +48,7 @@ class Collector(BenchPage):
 
     @property
     def collect(self):
-        return self.api(f"stations/{STATION}")["snapshot"]["collect"]
+        return self.snapshot()["collect"]
 
     def counts(self):
         uuid = self.page.locator("[data-session-uuid]").get_attribute("data-session-uuid")
@@ -76,7 +76,7 @@ class Collector(BenchPage):
         self.can_start()
         self.key("Enter")
         self.reaches("RUNNING")
-        eventually(lambda: self.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.5, "it is led")
+        eventually(lambda: self.snapshot()["run"]["elapsed"] > 1.5, "it is led")
         uuid = self.collect["episode"]
         self.key("Enter")
         self.closed(uuid)
@@ -218,7 +218,7 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(col
 
     eventually(recorded_again, "the next episode is open", 3 * PATIENCE_S)
     again = ann.collect["episode"]
-    eventually(lambda: ann.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.2, "it is led")
+    eventually(lambda: ann.snapshot()["run"]["elapsed"] > 1.2, "it is led")
 
     def stopped():
         if ann.collect["episode"] == again:

@@ -55,7 +55,7 @@ class Live(BenchPage):
 
     def control(self):
         """What control last did."""
-        return self.api(f"stations/{STATION}")["snapshot"]["control"]
+        return self.snapshot()["control"]
 
     def stops(self):
         self.press("stop")

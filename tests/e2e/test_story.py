@@ -157,7 +157,7 @@ def test_the_playback_says_whose_step_it_is_and_gives_the_streams_away(trial, op
 
 
 def test_space_on_a_page_that_is_not_a_stations_stops_no_robot(trial, operator):
-    assert operator.api(f"stations/{STATION}")["snapshot"]["state"] != "faulted"
+    assert operator.snapshot()["state"] != "faulted"
 
 
 @pytest.mark.story

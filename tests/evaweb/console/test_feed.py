@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 from django.conf import settings
 
+from evaweb.console import feed as feed_module
 from evaweb.console.feed import EVENTS_KEPT, History, LinkState, StationFeed
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
@@ -95,6 +97,34 @@ def test_a_dead_station_is_a_link_that_says_so(ear, runtime):
     ear.forget()
     runtime.mute = False
     ear.wait(lambda stream, content: (stream, content) == ("link", LinkState(True)))
+
+
+@pytest.mark.parametrize(("turns", "silent"), [([0.2] * 9, True), ([10.0, 0.2, 10.0], False)])
+def test_only_turns_in_which_the_web_itself_ran_count_as_silence(monkeypatch, turns, silent):
+    """The first is a station that says nothing, the second a machine that stood still twice."""
+    now, reasons = [0.0], []
+    left = iter(turns)
+
+    class Quiet:
+        def __init__(self, *_):
+            pass
+
+        def receive(self, timeout):
+            now[0] += next(left)
+            if now[0] >= sum(turns) - 1e-9:
+                reader._ended.set()
+            return {}
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(feed_module, "Subscriber", Quiet)
+    monkeypatch.setattr(feed_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    wire = SimpleNamespace(name="bench-1", address=lambda process, key: "ipc://here")
+    reader = feed_module._StateReader(None, wire)
+    reader.on_silence = reasons.append
+    reader._follow("ipc://here")
+    assert bool(reasons) is silent
 
 
 def test_a_station_that_was_never_started_is_a_link_that_says_so():
