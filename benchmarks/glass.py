@@ -135,7 +135,9 @@ def _displayed(lab: RunningLab, seconds: float) -> tuple[dict[int, float], dict[
             page.add_init_script(f"({_WATCH})({[CAMERA, BITS]!r})")
             page.goto(f"{lab.visitor.url}/stations/{STATION}/debug/")
             until = time.monotonic() + _SHOWN_S
-            while not page.evaluate("window.shown.length"):  # the page's policy forbids code from strings to wait there
+            while not page.evaluate(
+                "window.shown.length"
+            ):  # waiting in the page needs eval, which its policy forbids
                 if time.monotonic() > until:
                     raise SystemExit(f"the page shows no picture of {CAMERA} within {_SHOWN_S:g} s")
                 time.sleep(0.1)
