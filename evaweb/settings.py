@@ -181,6 +181,8 @@ SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https") if _HTTPS else Non
 SECURE_HSTS_SECONDS = int(environment.read_seconds("EVA_HSTS_S", 30 * 24 * 3600)) if _HTTPS else 0
 # Store of large immutable files: a folder or a bucket; None: the data folder.
 EVA_STORE = environment.store()
+# Age of closed recordings whose camera files are moved to the store [days]; None: never.
+EVA_ARCHIVE_DAYS = environment.archive_days("EVA_ARCHIVE_DAYS", EVA_STORE is not None)
 CONTENT_SECURITY_POLICY = headers.content_security_policy(getattr(EVA_STORE, "origin", ""))
 SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"

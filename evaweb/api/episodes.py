@@ -60,7 +60,8 @@ class EpisodeOut(Schema):
     """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for.
 
     `result` is success, partial (of demonstrations) or fail; "" if it was not rated. `away_since` is the time since
-    which the closed recording is only on its station's computer; null if it is here.
+    which the closed recording is only on its station's computer; null if it is here. `archived_at` is the time since
+    which its recorded videos are in the lab's store; null if they are not.
 
     While its checkpoint is hidden from the caller, the trial's code replaces the checkpoint's name, and every other
     field that could reveal it is empty.
@@ -91,6 +92,7 @@ class EpisodeOut(Schema):
     damage: list[DamageOut]
     verified_at: datetime | None
     away_since: datetime | None
+    archived_at: datetime | None
     tags: list[str]
 
     @staticmethod

@@ -35,6 +35,7 @@ KINDS = {
     "publish": "Publication",
     "export": "Table",
     "store": "Videos into the store",
+    "archive": "Recording into the store",
     "smoothness": "Smoothness",
     "sides": "Reviews of a published episode",
     "dataset": "Dataset",

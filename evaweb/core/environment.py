@@ -88,6 +88,21 @@ def gigabytes(name: str, default: float) -> float:
     return _number(name, default, 0.0, 1e6, "gigabytes from 0 to 1000000")
 
 
+def archive_days(name: str, stored: bool) -> float | None:
+    """Return the number of days in the environment variable `name`, at least 0; None if it is not set.
+
+    `stored` is whether there is a store, without which nothing can be archived.
+    """
+    if not os.environ.get(name, "").strip():
+        return None
+    days = _number(name, 0.0, 0.0, 1e5, "days from 0 to 100000")
+    if not stored:
+        raise ImproperlyConfigured(
+            f"{name} = {os.environ[name]!r}, and EVA_STORE names no store: set EVA_STORE, or remove {name}"
+        )
+    return days
+
+
 def niceness(name: str, default: int) -> int:
     """Return the process niceness in the environment variable `name`: from 0 (normal priority) to 19 (lowest)."""
     text = os.environ.get(name)

@@ -22,6 +22,7 @@ from django.conf import settings
 
 from evaweb.core.environment import Bucket
 from evaweb.core.errors import EvaError
+from runtime.core.durable_files import sync_folder
 from runtime.core.sentences import Pattern, fixed
 
 LONGEST_S = 300  # longest validity of a signed URL
@@ -261,6 +262,22 @@ def compared(store: Store, digest: str) -> None:
         actual.update(part)
     if actual.hexdigest() != digest:
         raise _changed(store, digest, actual.hexdigest())
+
+
+def fetch(store: Store, digest: str, path: Path) -> None:
+    """Write the object to `path`, which appears complete, flushed to disk and equal to its digest, or not at all.
+
+    Raises: StoreError if the store does not deliver it or it differs; OSError if the disk refuses it.
+    """
+    draft, actual = _draft(path.parent, store.read(digest))
+    try:
+        if actual != digest:
+            raise _changed(store, digest, actual)
+        draft.chmod(0o644)  # drafts are private
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+    sync_folder(path.parent)
 
 
 def _changed(store: Store, digest: str, actual: str) -> StoreError:

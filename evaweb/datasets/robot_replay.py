@@ -210,7 +210,7 @@ def _recording(uuid: UUID) -> PlayableEpisode:
     if row.damage:
         raise Conflict(_EPISODE_DAMAGED(uuid=uuid, damage="; ".join(damage["text"] for damage in row.damage)))
     try:
-        episode = open_episode(journal_folder(uuid))
+        episode = open_episode(journal_folder(uuid), videos=False)
     except RecordingError as error:
         raise Conflict(str(error)) from None
     table = episode.manifest["robot"]

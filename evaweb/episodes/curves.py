@@ -55,7 +55,9 @@ def curve_message(
     Raises:
         RecordingError: Names the absent or damaged file.
     """
-    return curve_streams(open_episode(folder), covered=covered, unscored=unscored, milestones=milestones)
+    return curve_streams(
+        open_episode(folder, videos=False), covered=covered, unscored=unscored, milestones=milestones
+    )
 
 
 def curve_streams(

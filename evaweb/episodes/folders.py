@@ -7,6 +7,8 @@ from uuid import UUID
 
 from django.conf import settings
 
+from runtime.recording.archive_index import FOLDER
+
 THUMBNAIL = "thumbnail.jpg"
 
 
@@ -23,6 +25,11 @@ def episodes_dir() -> Path:
 def journal_folder(uuid: UUID) -> Path:
     """Return the folder of one recording."""
     return episodes_dir() / str(uuid)
+
+
+def archive_folder() -> Path:
+    """Return the folder of the indexes of recordings whose camera files are in the lab's store."""
+    return data_dir() / FOLDER
 
 
 def preview_folder(uuid: UUID) -> Path:

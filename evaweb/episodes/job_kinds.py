@@ -13,6 +13,7 @@ from django.utils import timezone
 
 from evaweb.core.object_stores import the_store
 from evaweb.episodes import services, verification
+from evaweb.episodes.archive import NotArchived, bring_back, held_names, put_away, remove_unused
 from evaweb.episodes.arriving import ingest_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import write_sidecars
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
@@ -42,6 +43,8 @@ def preview(work: JobContext) -> Mapping[str, Any]:
     The job has one argument: `uuid`, the episode's.
     """
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
+    work.hold(held_names(episode.uuid))
+    bring_back(episode.uuid, work.report_progress)
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.report_progress)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
     if the_store() is not None:
@@ -56,6 +59,35 @@ def store_videos(work: JobContext) -> Mapping[str, Any]:
     The job has one argument: `uuid`, the episode's.
     """
     return {"videos": put_videos(UUID(work.args["uuid"]))}
+
+
+@job_kind("archive")
+def archive_recording(work: JobContext) -> Mapping[str, Any]:
+    """Move the camera files of a closed recording to the lab's store.
+
+    The job has one argument: `uuid`, the episode's. A recording that may not be moved stays as it is.
+    """
+    uuid = UUID(work.args["uuid"])
+    work.hold(held_names(uuid))
+    try:
+        return {"archived": True, "removed": put_away(uuid, work.report_progress)}
+    except NotArchived as refused:
+        return {"archived": False, "why": str(refused)}
+    except DamagedError as error:
+        verification.record_verification(error.verdict)
+        return {"archived": False, "why": str(error)}
+
+
+@periodic_task("recordings to be archived")
+def find_archivable() -> int:
+    """Queue the move of old recordings to the store if the workers are idle; return their number."""
+    return len(verification.request_archives())
+
+
+@periodic_task("videos that were brought back")
+def remove_unused_videos() -> int:
+    """Remove videos of archived recordings that no job has used for an hour; return the number of recordings."""
+    return remove_unused()
 
 
 @startup_task("videos to be stored")
@@ -112,6 +144,8 @@ def publish_episode(work: JobContext) -> Mapping[str, Any]:
         if episode.away_since is not None:
             reason = f"{whereabouts(episode)} It is published when it is."
         return {"published": False, "why": reason}
+    work.hold(held_names(episode.uuid))
+    bring_back(episode.uuid, work.report_progress)
     try:
         return _published(work, episode, folder)
     except RecordingError:
@@ -141,7 +175,8 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.report_progress(f"into {name}")
     dataset_folder = datasets_dir() / name
-    work.hold([dataset_folder.relative_to(data_dir()).as_posix()])
+    work.hold([dataset_folder.relative_to(data_dir()).as_posix(), *held_names(episode.uuid)])
+    bring_back(episode.uuid, work.report_progress)  # what it held was released for a moment
     with TemporaryDirectory() as scratch:
         placed = publish(
             folder,

@@ -90,6 +90,9 @@ class Episode(models.Model):
         blank=True,
         help_text="Since when it is closed on its station's computer and not here yet; none: it is not on its way.",
     )
+    archived_at = models.DateTimeField(
+        null=True, blank=True, help_text="Since when its camera files are in the store; none: they are not."
+    )
     created_at = models.DateTimeField(auto_now_add=True)
 
     class Meta:

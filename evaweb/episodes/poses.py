@@ -28,7 +28,7 @@ def pose_message(folder: Path, first: int) -> bytes:
     `first`.
     Raises: NotFound for an unknown robot or row; RecordingError, which names the absent or damaged file.
     """
-    return pose_streams(open_episode(folder), first)
+    return pose_streams(open_episode(folder, videos=False), first)
 
 
 def pose_streams(episode: Episode, first: int) -> bytes:

@@ -14,6 +14,7 @@ from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.core.errors import Conflict, EvaError
+from evaweb.episodes.archive import archived_at
 from evaweb.episodes.export_table import exported, job_key
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED, RecordedEpisode, read_recorded_episode
@@ -143,6 +144,7 @@ def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
         "previewed_at": _previewed_at(uuid),
         "damage": marked_damage(data_dir(), str(uuid)),
         "away_since": None,
+        "archived_at": archived_at(uuid),
     }
     episode, _ = Episode.objects.update_or_create(
         uuid=uuid,
@@ -185,6 +187,11 @@ def request_preview(*, episode: Episode) -> Job:
 def request_storing(*, uuid: UUID) -> Job:
     """Queue the transfer of an episode's preview videos to the lab's store."""
     return enqueue(kind="store", key=f"store:{uuid}", args={"uuid": str(uuid)})
+
+
+def request_archive(*, uuid: UUID) -> Job:
+    """Queue the move of an episode's camera files to the lab's store."""
+    return enqueue(kind="archive", key=f"archive:{uuid}", args={"uuid": str(uuid)})
 
 
 def request_export(*, episode: Episode) -> Job:

@@ -55,7 +55,7 @@ class Smoothness:
 def smoothness_in(folder: Path) -> Smoothness:
     """Return the smoothness of a recording. Raises: RecordingError, which names the absent or damaged file."""
     require_intact(folder, _FILES)
-    return smoothness_of(open_episode(folder))
+    return smoothness_of(open_episode(folder, videos=False))
 
 
 def smoothness_of(episode: Episode) -> Smoothness:

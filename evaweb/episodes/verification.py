@@ -5,21 +5,25 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+from django.conf import settings
 from django.db.models import F, Q, QuerySet
 from django.utils import timezone
 
+from evaweb.core.object_stores import StoreError
+from evaweb.episodes.archive import archived_at, bring_back, held_names
 from evaweb.episodes.folders import data_dir, journal_folder
-from evaweb.episodes.manifest import CLOSED
+from evaweb.episodes.manifest import CLOSED, read_recorded_episode
 from evaweb.episodes.models import Episode
-from evaweb.episodes.services import outcome_change
+from evaweb.episodes.services import outcome_change, request_archive
 from evaweb.jobs.kinds import JobContext
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
+from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 from runtime.recording.integrity import Damage, IntegrityCheck
 from runtime.recording.outcome_seal import MANIFEST, OUTCOME, OUTCOME_COPY
@@ -31,30 +35,95 @@ log = logging.getLogger(__name__)
 AGAIN_AFTER = timedelta(days=30)
 OLD_AFTER = timedelta(hours=1)  # a new recording is verified at its publication
 LATE_AFTER = timedelta(days=1)
+_PAUSE = timedelta(hours=1)  # after a failed job
+_ARCHIVED_AT_ONCE = 5
 MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # limits per job, because other jobs wait meanwhile
 
 
 def request_scrub() -> Job | None:
     """Queue the verification of due recordings if the workers are idle; return the job, else None."""
-    at_work = Job.objects.filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING))
-    if at_work.exists() or not _due().exists():
+    archived = not _failed_lately(
+        "scrub"
+    )  # perhaps the store is away: meanwhile the other recordings are verified
+    if _anything_queued() or not _due(archived).exists():
         return None
-    return enqueue(kind="scrub", key="scrub", args={})
+    return enqueue(kind="scrub", key="scrub", args={} if archived else {"archived": False})
+
+
+def request_archives() -> list[Job]:
+    """Queue the move of a few old recordings to the lab's store if the workers are idle; return the jobs.
+
+    Each is asked for again only a month after a job has left it as it is. After a job has failed, none is for an hour.
+    """
+    if settings.EVA_ARCHIVE_DAYS is None or _anything_queued() or _failed_lately("archive"):
+        return []
+    now = timezone.now()
+    limit = now - timedelta(days=settings.EVA_ARCHIVE_DAYS)
+    rows = Episode.objects.filter(
+        *(
+            Q(status__in=CLOSED),
+            Q(damage=[]),
+            Q(away_since=None),
+            Q(archived_at=None),
+            ~Q(kind=IMPORTED),
+            ~Q(seal=""),
+        ),
+        *(Q(previewed_at__isnull=False), Q(verified_at__isnull=False), Q(started_at__lt=limit)),
+    )
+    asked = Job.objects.filter(kind="archive", finished_at__gt=now - AGAIN_AFTER)
+    uuids = []
+    for uuid in rows.order_by("started_at").values_list("uuid", flat=True)[:MOST_EPISODES]:
+        if (
+            len(uuids) < _ARCHIVED_AT_ONCE
+            and _closed_before(uuid, limit)
+            and not asked.filter(key=f"archive:{uuid}")
+        ):
+            uuids.append(uuid)
+    return [request_archive(uuid=uuid) for uuid in uuids]
+
+
+def _closed_before(uuid: UUID, limit: datetime) -> bool:
+    try:
+        ended = read_recorded_episode(journal_folder(uuid)).ended_at
+    except RecordingError:
+        return False  # the next verification finds out why
+    return ended is not None and ended < limit
+
+
+def _anything_queued() -> bool:
+    return Job.objects.filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING)).exists()
+
+
+def _failed_lately(kind: str) -> bool:
+    failed = Job.objects.filter(kind=kind, status=JobStatus.FAILED, cancelled_by=None)
+    return failed.filter(finished_at__gt=timezone.now() - _PAUSE).exists()
 
 
 def scrub_due(work: JobContext) -> Mapping[str, Any]:
     """Verify the next due recordings and store each result immediately.
 
+    Camera files that are in the lab's store are brought back for it. After the store has failed once, other archived
+    recordings wait.
+
     Returns: Number of recordings by result.
+    Raises: StoreError after all others, if a recording could not be verified because of the store.
     """
+    archived, failed = bool(work.args.get("archived", True)), None
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
-    for uuid in _next():
+    for uuid in _next(archived):
         if read >= MOST_BYTES:
             break
+        if failed is not None and archived_at(uuid) is not None:
+            continue
         work.report_progress(f"{sum(counts.values())} verified, {len(damaged)} damaged")
         try:
+            work.hold(held_names(uuid))
+            bring_back(uuid)
             verdict = record_verification(_verify_folder(journal_folder(uuid)))
+        except StoreError as error:
+            failed = error
+            continue
         except RecordingError as error:
             problems.append(str(error))
             Episode.objects.filter(uuid=uuid).update(verified_at=timezone.now())
@@ -62,6 +131,8 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
         counts[verdict.state] += 1
         read += verdict.bytes
         damaged += [{"uuid": str(uuid), "why": verdict.text}] if verdict.state == "damaged" else []
+    if failed is not None:
+        raise failed
     return {**counts, "bytes": read, "found": damaged, "problems": problems}
 
 
@@ -119,14 +190,15 @@ def unverified() -> tuple[int, int]:
     )
 
 
-def _due() -> QuerySet[Episode]:
+def _due(archived: bool = True) -> QuerySet[Episode]:
     now = timezone.now()
     fresh = Q(verified_at=None) & Q(created_at__gte=now - OLD_AFTER)
-    return Episode.objects.filter(
+    rows = Episode.objects.all() if archived else Episode.objects.filter(archived_at=None)
+    return rows.filter(
         Q(verified_at=None) | Q(verified_at__lt=now - AGAIN_AFTER), status__in=CLOSED, away_since=None
     ).exclude(fresh)
 
 
-def _next() -> Iterator[UUID]:
-    rows = _due().order_by(F("verified_at").asc(nulls_first=True), "created_at")
+def _next(archived: bool) -> Iterator[UUID]:
+    rows = _due(archived).order_by(F("verified_at").asc(nulls_first=True), "created_at")
     yield from rows.values_list("uuid", flat=True)[:MOST_EPISODES]

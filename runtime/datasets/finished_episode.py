@@ -107,9 +107,12 @@ class FinishedEpisode:
         return self.episode.rows.column(name).combine_chunks()
 
 
-def read_finished_episode(folder: Path) -> FinishedEpisode:
-    """Read the closed episode in `folder`. Raises: RecordingError if there is no episode or it is still open."""
-    episode = open_episode(folder)
+def read_finished_episode(folder: Path, videos: bool = True) -> FinishedEpisode:
+    """Read the closed episode in `folder`, without its videos if these are not needed.
+
+    Raises: RecordingError if there is no episode or it is still open.
+    """
+    episode = open_episode(folder, videos)
     if episode.outcome is None:
         raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")
     robot = episode.manifest["robot"]

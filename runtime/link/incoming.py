@@ -28,6 +28,7 @@ from runtime.core.errors import CodecError, RecordingError
 from runtime.link.contents import MANIFEST, Contents, File, contents_of, is_episode, unpacked
 from runtime.link.wire import PIECE, Arrived, Declined, Labels, Message, Offer, Piece, Want
 from runtime.link.yielding import lower_priority
+from runtime.recording.archive_index import stored_files
 from runtime.recording.files import disk_error, read_json, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
@@ -330,7 +331,7 @@ class Shelf:
 
         Raises: _Unwanted, which declines the offer, if they differ; nothing is overwritten.
         """
-        existing = contents_of(self._episodes / episode)
+        existing = self._existing(episode, contents)
         if existing != contents:
             differing = [file.name for file in contents.files if file not in existing.files]
             raise _Unwanted(
@@ -339,6 +340,16 @@ class Shelf:
                 _NEVER_S,
             )
         return self._arrived(episode, contents)
+
+    def _existing(self, episode: str, contents: Contents) -> Contents:
+        """Return the files of an episode that the lab has, with those of `contents` that are in its store alone."""
+        folder = self._episodes / episode
+        here, stored = contents_of(folder), stored_files(folder)
+        names = {file.name for file in here.files}
+        away = [
+            file for file in contents.files if file.name not in names and stored.get(file.name) == file.sha256
+        ]
+        return Contents(tuple(sorted((*here.files, *away), key=lambda file: file.name)))
 
     def _arrived(self, episode: str, contents: Contents) -> Message:
         self._request_reconcile(episode)

@@ -124,14 +124,15 @@ class ReplayPolicy(Policy):
 
     def _recording(self) -> _Recorded:
         from runtime.datasets.finished_episode import read_finished_episode
-        from runtime.recording.scrub import require_intact
+        from runtime.recording.scrub import files_here, require_intact
 
         if self._config.episode:
             raise PolicyError(
                 f"policy.episode = {self._config.episode}, but {self._config.path} is one recorded episode; allowed: 0"
             )
-        state = require_intact(Path(self._config.path)).state
-        journal = read_finished_episode(Path(self._config.path))
+        folder = Path(self._config.path)
+        state = require_intact(folder, files_here(folder)).state  # its videos may be in the lab's store
+        journal = read_finished_episode(folder, videos=False)
         poses = self._config.space == "eef"
         column, key = ("eef_action", "eef_names") if poses else ("action", "joint_names")
         if poses and not journal.has_stream(column):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RecordingError
+from runtime.recording.archive_index import stored_files
 from runtime.recording.export import write_export
 from runtime.recording.quarantine import update_mark
 from runtime.recording.reader import Episode, open_episode
@@ -112,7 +113,7 @@ def _line(report: RepairReport) -> str:
 
 
 def _show(path: Path) -> int:
-    episode = open_episode(path)
+    episode = open_episode(path, videos=False)
     print(*_lines(episode), sep="\n")
     return 0
 
@@ -129,8 +130,20 @@ def _lines(episode: Episode) -> list[str]:
         f"ticks     {episode.ticks.num_rows}, {episode.smoothed.num_rows} asked for something",
         f"raw       {episode.raw.num_rows} rows of chunks",
         f"events    {len(episode.events)}",
-        *(f"video     {camera}: {video.stat().st_size} bytes" for camera, video in episode.videos.items()),
+        *(
+            f"video     {camera}: {_size(episode.path / f'{camera}.mp4')}"
+            for camera in episode.layout.cameras
+        ),
     ]
+
+
+def _size(video: Path) -> str:
+    """Return the size of a video as words. Raises RecordingError if it is neither here nor in the lab's store."""
+    if video.is_file():
+        return f"{video.stat().st_size} bytes"
+    if video.name in stored_files(video.parent):
+        return "in the lab's store"
+    raise RecordingError(f"{video} is absent, but the manifest lists camera {video.stem}")
 
 
 def _export(paths: Sequence[Path], to: Path | None) -> int:

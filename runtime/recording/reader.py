@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.core.errors import RecordingError
+from runtime.recording.archive_index import require_not_stored
 from runtime.recording.files import read_json
 from runtime.recording.layout import Layout
 from runtime.recording.outcome_seal import OUTCOME, read_outcome, without_digests
@@ -50,8 +51,12 @@ class Episode:
         return min(self.frames, int(self.lost[camera]["row"])) if camera in self.lost else self.frames
 
 
-def open_episode(path: Path) -> Episode:
-    """Read the episode in folder `path`. Raises RecordingError with the file that is absent or damaged."""
+def open_episode(path: Path, videos: bool = True) -> Episode:
+    """Read the episode in folder `path`; without `videos`, `Episode.videos` is empty.
+
+    A reader of numbers needs no videos, which may be in the lab's store. Raises RecordingError with the file that is
+    absent or damaged, or in the store.
+    """
     manifest = read_json(path / "manifest.json")
     layout = Layout.from_manifest(manifest)
     outcome = without_digests(read_outcome(path)) if (path / OUTCOME).exists() else None
@@ -70,7 +75,7 @@ def open_episode(path: Path) -> Episode:
         smoothed=tables["smoothed"],
         raw=tables["raw"],
         events=tuple(json.loads(line) for line in read_events(path / "events.jsonl").lines),
-        videos={camera: _video(path, camera) for camera in layout.cameras},
+        videos={camera: _video(path, camera) for camera in layout.cameras} if videos else {},
     )
 
 
@@ -119,5 +124,6 @@ def _frames(path: Path, outcome: Mapping[str, object], rows: int) -> int:
 def _video(path: Path, camera: str) -> Path:
     video = path / f"{camera}.mp4"
     if not video.is_file():
+        require_not_stored(video)
         raise RecordingError(f"{video} is absent, but the manifest lists camera {camera}")
     return video

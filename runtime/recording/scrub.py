@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from runtime.core.errors import RecordingError
+from runtime.recording.archive_index import require_not_stored, stored_files
 from runtime.recording.damage_marks import known_damage
 from runtime.recording.digests import FileDigest
 from runtime.recording.files import disk_error, read_json
@@ -34,7 +35,8 @@ from runtime.recording.unreadable_files import find_unreadable
 def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
     """Check all files of the episode in `folder`, or only `files`, against their digests; return the result.
 
-    Raises RecordingError if the folder is no episode or cannot be read.
+    Raises RecordingError if the folder is no episode or cannot be read, or if one of these files is in the lab's store:
+    it is absent then, and not damaged.
     """
     if not (folder / OUTCOME).exists():
         return _without_outcome(folder)
@@ -121,6 +123,18 @@ def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
     return verdict
 
 
+def files_here(folder: Path) -> tuple[str, ...]:
+    """Return the files of a closed episode that are not in the lab's store alone; () if none is there alone.
+
+    The result is the argument `files` of a check that needs no videos. Raises RecordingError if the outcome or the
+    index cannot be read.
+    """
+    stored = {name for name in stored_files(folder) if not (folder / name).exists()}
+    return (
+        tuple(name for name in read_outcome(folder).get(DIGESTS, ()) if name not in stored) if stored else ()
+    )
+
+
 def episodes_in(path: Path) -> list[Path]:
     """Return the folders of the episodes at `path`, which is one of three.
 
@@ -151,6 +165,7 @@ def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> D
                 return None
             return _located(path.name, file, digest, _rate(path.name, manifest))
     except FileNotFoundError:
+        require_not_stored(path)
         return Damage(path.name, "is absent")
     except IsADirectoryError:
         return Damage(path.name, "is a folder")

@@ -24,6 +24,8 @@ _LEFT_OUT = {  # entries of the data folder that are recreated at the next start
     "logs",
     "stops.json",
 }
+# Copied last: a camera file that was moved to the store during the copy is then in the index, which names it there.
+_LAST = "archived"
 _LEFT_OUT_ANYWHERE = {
     "bus.key",
     "endpoints",
@@ -75,7 +77,7 @@ class FileCopies:
         Raises:
             BackupError: If a file cannot be read, or the disk is full; it names the file.
         """
-        for top in sorted(os.scandir(self._data), key=lambda entry: entry.name):
+        for top in sorted(os.scandir(self._data), key=lambda entry: (entry.name == _LAST, entry.name)):
             if top.name in _LEFT_OUT or Path(top.path).absolute() in self._without:
                 continue
             if not top.is_dir(follow_symlinks=False):
