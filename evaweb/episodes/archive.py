@@ -10,7 +10,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from uuid import UUID
@@ -22,6 +22,7 @@ from evaweb.core.object_stores import Store, StoreError, compared, fetch, requir
 from evaweb.episodes.folders import archive_folder, data_dir, journal_folder
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode
+from evaweb.jobs.kinds import JobContext
 from evaweb.jobs.models import Hold, JobStatus
 from runtime.core.durable_files import sync_folder
 from runtime.core.sentences import Pattern
@@ -68,9 +69,26 @@ def archived_at(uuid: UUID) -> datetime | None:
         return None
 
 
-def held_names(uuid: UUID) -> list[str]:
-    """Return the names that a job holds while it reads the videos of a recording, or moves them."""
-    return [f"episodes/{uuid}"] if the_store() is not None else []
+def lock_recording(work: JobContext, uuid: UUID, also: Collection[str] = ()) -> None:
+    """Let the job hold the videos of a recording, and the names in `also`, until it ends or holds others.
+
+    Jobs that read recorded videos, and those that move them, exclude each other.
+    """
+    if names := [*also, *_lock_names(uuid)]:
+        work.hold(names)
+
+
+def use_videos(work: JobContext, uuid: UUID, also: Collection[str] = ()) -> None:
+    """Let the job hold the videos of a recording as `lock_recording` does, and bring back those that are absent.
+
+    Raises: StoreError, RecordingError, as `bring_back`.
+    """
+    lock_recording(work, uuid, also)
+    bring_back(uuid, work.report_progress)
+
+
+def _lock_names(uuid: UUID) -> list[str]:
+    return [f"episodes/{uuid}"] if the_store() is not None else []  # without a store nothing is moved
 
 
 def why_not(episode: Episode) -> str:
@@ -170,7 +188,7 @@ def bring_back(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> in
     A reader sees a whole file or none. Do nothing for a recording that is not in the store.
 
     Raises:
-        StoreError: There is no store, it does not answer, or it gives another file.
+        StoreError: There is no store, it does not answer or gives another file, or there is no room here.
         RecordingError: The index cannot be read, or the disk refuses the files.
     """
     files, folder = archived_files(uuid), journal_folder(uuid)
@@ -214,9 +232,9 @@ def remove_unused(now: float | None = None, besides: UUID | None = None) -> int:
         enough = UNUSED_S if size <= settings.EVA_CACHE_BYTES else _IN_USE_S
         if now - used < enough or removed >= _AT_ONCE:
             break
-        if is_held(uuid):
+        if is_in_use(uuid):
             continue
-        if why := _why_kept(store, uuid):
+        if why := _removal_obstacle(store, uuid):
             log.warning("the videos of episode %s stay here: %s", uuid, why)
             os.utime(_mark(uuid), (now, now))
             continue
@@ -226,7 +244,7 @@ def remove_unused(now: float | None = None, besides: UUID | None = None) -> int:
     return removed
 
 
-def _why_kept(store: Store, uuid: UUID) -> str:
+def _removal_obstacle(store: Store, uuid: UUID) -> str:
     """Return why local files must not be removed: the store lacks one, or does not answer; "" if they may be."""
     try:
         absent = [name for name, digest in archived_files(uuid).items() if not store.exists(digest)]
@@ -236,17 +254,17 @@ def _why_kept(store: Store, uuid: UUID) -> str:
 
 
 def _require_room(uuid: UUID, folder: Path, absent: dict[str, str]) -> None:
-    """Raise RecordingError if the files would take the room that the lab keeps free for recordings."""
+    """Raise StoreError if the files would take the room that the lab keeps free for recordings."""
     digests = read_outcome(folder).get(DIGESTS, {})
     wanted = sum(int(digests[name]["bytes"]) for name in absent if name in digests)
     free = shutil.disk_usage(folder).free
     if free - wanted < settings.EVA_RESERVE_BYTES:
-        raise RecordingError(_NO_ROOM(uuid=uuid, wanted=wanted, free=free))
+        raise StoreError(_NO_ROOM(uuid=uuid, wanted=wanted, free=free))
 
 
-def is_held(uuid: UUID) -> bool:
+def is_in_use(uuid: UUID) -> bool:
     """Return True if a running job reads the videos of a recording, or moves them."""
-    return Hold.objects.filter(what__in=held_names(uuid), job__status=JobStatus.RUNNING).exists()
+    return Hold.objects.filter(what__in=_lock_names(uuid), job__status=JobStatus.RUNNING).exists()
 
 
 def _mark(uuid: UUID) -> Path:

@@ -13,7 +13,7 @@ from django.utils import timezone
 
 from evaweb.core.object_stores import the_store
 from evaweb.episodes import services, verification
-from evaweb.episodes.archive import NotArchived, bring_back, held_names, put_away, remove_unused
+from evaweb.episodes.archive import NotArchived, lock_recording, put_away, remove_unused, use_videos
 from evaweb.episodes.arriving import ingest_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import write_sidecars
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
@@ -43,8 +43,7 @@ def preview(work: JobContext) -> Mapping[str, Any]:
     The job has one argument: `uuid`, the episode's.
     """
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
-    work.hold(held_names(episode.uuid))
-    bring_back(episode.uuid, work.report_progress)
+    use_videos(work, episode.uuid)
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.report_progress)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
     if the_store() is not None:
@@ -68,7 +67,7 @@ def archive_recording(work: JobContext) -> Mapping[str, Any]:
     The job has one argument: `uuid`, the episode's. A recording that may not be moved stays as it is.
     """
     uuid = UUID(work.args["uuid"])
-    work.hold(held_names(uuid))
+    lock_recording(work, uuid)
     try:
         return {"archived": True, "removed": put_away(uuid, work.report_progress)}
     except NotArchived as refused:
@@ -144,8 +143,7 @@ def publish_episode(work: JobContext) -> Mapping[str, Any]:
         if episode.away_since is not None:
             reason = f"{whereabouts(episode)} It is published when it is."
         return {"published": False, "why": reason}
-    work.hold(held_names(episode.uuid))
-    bring_back(episode.uuid, work.report_progress)
+    use_videos(work, episode.uuid)
     try:
         return _published(work, episode, folder)
     except RecordingError:
@@ -175,8 +173,8 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.report_progress(f"into {name}")
     dataset_folder = datasets_dir() / name
-    work.hold([dataset_folder.relative_to(data_dir()).as_posix(), *held_names(episode.uuid)])
-    bring_back(episode.uuid, work.report_progress)  # what it held was released for a moment
+    # Again, because what the job held before was released for a moment.
+    use_videos(work, episode.uuid, [dataset_folder.relative_to(data_dir()).as_posix()])
     with TemporaryDirectory() as scratch:
         placed = publish(
             folder,

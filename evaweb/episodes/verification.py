@@ -15,7 +15,7 @@ from django.db.models import F, Q, QuerySet
 from django.utils import timezone
 
 from evaweb.core.object_stores import StoreError
-from evaweb.episodes.archive import archived_at, bring_back, held_names
+from evaweb.episodes.archive import archived_at, use_videos
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.manifest import CLOSED, read_recorded_episode
 from evaweb.episodes.models import Episode
@@ -59,24 +59,16 @@ def request_archives() -> list[Job]:
         return []
     now = timezone.now()
     limit = now - timedelta(days=settings.EVA_ARCHIVE_DAYS)
-    rows = Episode.objects.filter(
-        *(
-            Q(status__in=CLOSED),
-            Q(damage=[]),
-            Q(away_since=None),
-            Q(archived_at=None),
-            ~Q(kind=IMPORTED),
-            ~Q(seal=""),
-        ),
-        *(Q(previewed_at__isnull=False), Q(verified_at__isnull=False), Q(started_at__lt=limit)),
-    )
+    here = Episode.objects.filter(status__in=CLOSED, damage=[], away_since=None, archived_at=None)
+    rows = here.filter(previewed_at__isnull=False, verified_at__isnull=False, started_at__lt=limit)
+    rows = rows.exclude(kind=IMPORTED).exclude(seal="")
     asked = Job.objects.filter(kind="archive", finished_at__gt=now - AGAIN_AFTER)
     uuids = []
     for uuid in rows.order_by("started_at").values_list("uuid", flat=True)[:MOST_EPISODES]:
         if (
             len(uuids) < _ARCHIVED_AT_ONCE
+            and not asked.filter(key=f"archive:{uuid}").exists()
             and _closed_before(uuid, limit)
-            and not asked.filter(key=f"archive:{uuid}")
         ):
             uuids.append(uuid)
     return [request_archive(uuid=uuid) for uuid in uuids]
@@ -106,9 +98,10 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
     recordings wait.
 
     Returns: Number of recordings by result.
-    Raises: StoreError after all others, if a recording could not be verified because of the store.
+    Raises: StoreError or RecordingError after all others, if videos could not be brought back.
     """
-    archived, failed = bool(work.args.get("archived", True)), None
+    archived = bool(work.args.get("archived", True))
+    failed: Exception | None = None
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
     for uuid in _next(archived):
@@ -118,12 +111,12 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
             continue
         work.report_progress(f"{sum(counts.values())} verified, {len(damaged)} damaged")
         try:
-            work.hold(held_names(uuid))
-            bring_back(uuid)
-            verdict = record_verification(_verify_folder(journal_folder(uuid)))
-        except StoreError as error:
+            use_videos(work, uuid)
+        except (StoreError, RecordingError) as error:
             failed = error
             continue
+        try:
+            verdict = record_verification(_verify_folder(journal_folder(uuid)))
         except RecordingError as error:
             problems.append(str(error))
             Episode.objects.filter(uuid=uuid).update(verified_at=timezone.now())

@@ -11,7 +11,7 @@ from uuid import UUID
 
 from django.db import transaction
 
-from evaweb.episodes.archive import bring_back, held_names
+from evaweb.episodes.archive import use_videos
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.models import Episode
 from evaweb.jobs.kinds import JobContext, job_kind, periodic_task
@@ -42,8 +42,7 @@ def quality(work: JobContext) -> Mapping[str, Any]:
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     bounds = bounds_file()
     settings = read_settings(bounds) if bounds.exists() else QualitySettings()
-    work.hold(held_names(episode.uuid))
-    bring_back(episode.uuid, work.report_progress)
+    use_videos(work, episode.uuid)
     work.report_progress("every frame and picture is looked at")
     report = _inspected(episode, settings).to_dict()
     path = report_file(episode.uuid)

@@ -32,10 +32,11 @@ from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import run_queue
 from evaweb.reviews.record import report_file
 from evaweb.reviews.services import request_quality_check
+from runtime.recording.__main__ import main
 from runtime.recording.files import RecordingError
 from runtime.recording.quarantine import marked_damage
 from runtime.recording.reader import open_episode
-from runtime.recording.scrub import verify_episode
+from runtime.recording.scrub import files_here, require_intact, verify_episode
 
 pytestmark = pytest.mark.django_db
 
@@ -112,10 +113,13 @@ def test_numbers_are_read_without_the_videos_and_a_video_says_where_it_is(
     for reader in (open_episode, verify_episode):
         with pytest.raises(RecordingError, match=rf"store.*manage\.py archive --back {old.uuid}"):
             reader(folder)
+    assert main(["scrub", str(folder)]) == 2
+    assert require_intact(folder, files_here(folder)).state == "sound"
+    Episode.objects.update(archived_at=None)
     assert reconcile().problems == ()
     old.refresh_from_db()
     assert (old.status, old.damage, marked_damage(data, str(old.uuid))) == ("finished", [], [])
-    assert old.archived_at is not None
+    assert old.archived_at is not None, "the disk is the authority"
 
 
 class KilledError(BaseException):

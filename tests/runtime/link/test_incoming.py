@@ -1,5 +1,6 @@
 """What a lab does with what a station sends of its episodes: honest, cut off at any byte, or hostile."""
 
+import hashlib
 import json
 import os
 from dataclasses import replace
@@ -10,6 +11,7 @@ from runtime.link import incoming
 from runtime.link.contents import Contents, File, contents_of, unpacked
 from runtime.link.incoming import Shelf, arrivals, progress_of
 from runtime.link.wire import PIECE, Arrived, Declined, Labels, Offer, Piece, Want
+from runtime.recording.archive_index import write_index
 from tests.runtime.link.episodes import content, recorded, uuid_of
 
 STATION = "bench-7"
@@ -109,6 +111,18 @@ def test_one_that_is_here_with_other_content_is_refused_by_name_and_stays(data, 
     before = content(data / "episodes" / UUID)
     assert "already, with other content (front.mp4): nothing is overwritten" in why(offered(shelf, home))
     assert content(data / "episodes" / UUID) == before
+
+
+def test_one_whose_videos_the_lab_has_in_its_store_has_arrived(data, shelf, home):
+    sent(shelf, home, offered(shelf, home))
+    video = data / "episodes" / UUID / "front.mp4"
+    digest = hashlib.sha256(video.read_bytes()).hexdigest()
+    video.unlink()
+    write_index(data, UUID, {"front.mp4": digest})
+    (answer,) = offered(shelf, home)
+    assert isinstance(answer, Arrived)
+    write_index(data, UUID, {"front.mp4": "0" * 64})
+    assert "with other content (front.mp4)" in why(offered(shelf, home))
 
 
 def test_one_that_appears_meanwhile_is_not_overwritten(data, shelf, home):

@@ -17,6 +17,7 @@ from runtime.datasets.finished_episode import read_finished_episode
 from runtime.datasets.mapping import ColumnMapping
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy
+from runtime.recording.archive_index import write_index
 from tests.runtime.datasets.foreign import Plan, column, write
 from tests.runtime.datasets.small import record, robot, write_dataset
 from tests.runtime.recording.samples import resealed
@@ -236,3 +237,14 @@ def test_the_same_joints_in_another_order_are_refused(tmp_path: Path) -> None:
     policy = replay.build(Config(path=str(episode)), robot(), VirtualClock(), FPS)
     with pytest.raises(PolicyError, match="the actions are of the joints"):
         policy.connect()
+
+
+def test_a_recording_whose_videos_are_in_the_labs_store_is_replayed(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=FRAMES)
+    rows = connected(episode, horizon=5).infer(observation(0)).actions
+    videos = {path.name: "0" * 64 for path in episode.glob("*.mp4")}
+    write_index(tmp_path, episode.name, videos)
+    for name in videos:
+        (episode / name).unlink()
+    assert videos
+    assert np.array_equal(connected(episode, horizon=5).infer(observation(0)).actions, rows)

@@ -8,7 +8,7 @@ from uuid import UUID
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 from evaweb.core.errors import EvaError
-from evaweb.episodes.archive import archived_files, bring_back, is_held, put_away
+from evaweb.episodes.archive import archived_files, bring_back, is_in_use, put_away
 from runtime.recording.files import RecordingError
 
 
@@ -36,7 +36,7 @@ class Command(BaseCommand):
 
 
 def _moved(uuid: UUID) -> str:
-    if is_held(uuid):
+    if is_in_use(uuid):
         raise RecordingError("a job is at work on it: try again when it is done")
     removed = put_away(uuid)
     return f"in the store, {removed} files removed here" if removed else "in the store already"
