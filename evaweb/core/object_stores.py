@@ -80,6 +80,8 @@ class FolderStore:
             target = self._at(digest)
             target.parent.mkdir(exist_ok=True)
             os.replace(draft, target)  # an existing file has the same content
+            for folder in (target.parent, self.folder):
+                sync_folder(folder)  # the caller may remove the only other copy
         except OSError as error:
             raise self._failed("take a file", error) from None
         return digest

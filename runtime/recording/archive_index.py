@@ -10,9 +10,10 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.recording.damage_marks import data_of
-from runtime.recording.files import read_json, to_json, write_atomic
+from runtime.recording.files import disk_error, read_json, to_json, write_atomic
 
 FOLDER = "archived"
 CAMERA_FILES = ".mp4"
@@ -44,7 +45,11 @@ def stored_files(folder: Path) -> dict[str, str]:
 def write_index(data: Path, uuid: str, files: Mapping[str, str]) -> None:
     """Write a recording's index so that it survives a power cut. Raises RecordingError."""
     path = index_file(data, uuid)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        sync_folder(data)
+    except OSError as error:
+        raise disk_error("writing", path, error) from error
     write_atomic(path, to_json({"files": dict(files)}, "the index of stored files", indent=1))
 
 

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from django.contrib.auth.models import User
 from django.core.exceptions import ImproperlyConfigured
 from django.core.management import CommandError, call_command
+from django.test import Client
 from django.utils import timezone
 
 from evaweb.core import environment
@@ -23,13 +25,14 @@ from evaweb.episodes import archive, services, verification
 from evaweb.episodes.archive import NotArchived, bring_back, put_away, remove_unused
 from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curve_message
+from evaweb.episodes.folders import archive_folder, journal_folder
 from evaweb.episodes.job_kinds import find_archivable
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.poses import pose_message
 from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.smoothness import smoothness_in
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.services import run_queue
+from evaweb.jobs.services import enqueue, run_queue
 from evaweb.reviews.record import report_file
 from evaweb.reviews.services import request_quality_check
 from runtime.recording.__main__ import main
@@ -62,7 +65,7 @@ def old(closed: Callable[..., Episode]) -> Episode:
 
 
 def episode_folder(episode: Episode) -> Path:
-    return archive.journal_folder(episode.uuid)
+    return journal_folder(episode.uuid)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -74,7 +77,7 @@ def videos(episode: Episode) -> list[Path]:
 
 
 def index(episode: Episode) -> Path:
-    return archive.archive_folder() / f"{episode.uuid}.json"
+    return archive_folder() / f"{episode.uuid}.json"
 
 
 def performed(job: Job | None) -> Job:
@@ -122,6 +125,22 @@ def test_numbers_are_read_without_the_videos_and_a_video_says_where_it_is(
     assert old.archived_at is not None, "the disk is the authority"
 
 
+def test_its_page_and_rest_say_that_its_videos_are_in_the_store(
+    old: Episode, store: FolderStore, client: Client, vera: User
+) -> None:
+    client.force_login(vera)
+
+    def told() -> tuple[bool, Any]:
+        page = client.get(f"/replay/{old.uuid}/").content.decode()
+        fields = client.get(f"/api/v1/episodes/{old.uuid}").json()
+        return "recorded videos in the store" in page, fields["archived_at"]
+
+    assert told() == (False, None)
+    put_away(old.uuid)
+    assert told()[0]
+    assert told()[1]
+
+
 class KilledError(BaseException):
     """What a kill -9 is here."""
 
@@ -141,7 +160,8 @@ def test_a_move_that_was_killed_runs_again_to_the_same_end(
         elif point == "after the index":
             patch.setattr(archive, "_remove", kill)
         else:
-            real, seen = Path.unlink, []
+            real = Path.unlink
+            seen: list[Path] = []
 
             def once(path: Path, missing_ok: bool = False) -> None:
                 if seen:
@@ -215,7 +235,7 @@ def test_a_store_that_is_away_fails_the_job_with_its_sentence_and_marks_nothing(
         services.request_publish(episode=old),
         request_quality_check(episode=old),
         services.request_preview(episode=old),
-        verification.request_scrub() or services.enqueue(kind="scrub", key="scrub", args={}),
+        verification.request_scrub() or enqueue(kind="scrub", key="scrub", args={}),
     ):
         performed(job)
         assert (job.status, job.attempts) == (JobStatus.QUEUED, 1)
@@ -234,7 +254,7 @@ def test_what_was_brought_back_is_removed_after_an_hour_without_use(
 ) -> None:
     put_away(old.uuid)
     bring_back(old.uuid)
-    used = (archive.archive_folder() / "here" / str(old.uuid)).stat().st_mtime
+    used = (archive_folder() / "here" / str(old.uuid)).stat().st_mtime
     assert remove_unused(used + 3599) == 0
     hidden = store.folder.with_name(f"{store.folder.name}-away")
     store.folder.rename(hidden)
@@ -246,7 +266,7 @@ def test_what_was_brought_back_is_removed_after_an_hour_without_use(
     assert videos(old) == []
     bring_back(old.uuid)
     settings.EVA_CACHE_BYTES = 1
-    used = (archive.archive_folder() / "here" / str(old.uuid)).stat().st_mtime
+    used = (archive_folder() / "here" / str(old.uuid)).stat().st_mtime
     assert [remove_unused(used + age) for age in (599, 601)] == [0, 1]
     assert remove_unused(used + 10**6) == 0
 
@@ -320,6 +340,24 @@ def test_the_command_moves_and_brings_back_with_a_line_for_each(old: Episode, st
     Episode.objects.update(status=EpisodeStatus.RECORDING)
     with pytest.raises(CommandError, match="1 of 1 could not be moved"):
         call_command("archive", str(old.uuid), stderr=io.StringIO())
+
+
+def test_a_fetch_that_was_killed_leaves_no_file_that_a_reader_sees(
+    old: Episode, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = content(episode_folder(old))
+    put_away(old.uuid)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", kill)
+        patch.setattr(Path, "unlink", lambda path, missing_ok=False: None)  # a kill tidies nothing up
+        with pytest.raises(KilledError):
+            bring_back(old.uuid)
+    assert [path for path in episode_folder(old).iterdir() if path.name.startswith(".draft")]
+    assert videos(old) == []
+    assert bring_back(old.uuid) == 3
+    put_away(old.uuid)
+    bring_back(old.uuid)
+    assert content(episode_folder(old)) == before
 
 
 def test_days_without_a_store_end_the_start_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
