@@ -143,10 +143,10 @@ def publish_episode(work: JobContext) -> Mapping[str, Any]:
         if episode.away_since is not None:
             reason = f"{whereabouts(episode)} It is published when it is."
         return {"published": False, "why": reason}
-    use_videos(work, episode.uuid)
     try:
         return _published(work, episode, folder)
     except RecordingError:
+        use_videos(work, episode.uuid)
         verdict = verification.compare_with_row(episode, verify_episode(folder))
         if verdict.state != "damaged":
             raise
@@ -173,7 +173,6 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.report_progress(f"into {name}")
     dataset_folder = datasets_dir() / name
-    # Again, because what the job held before was released for a moment.
     use_videos(work, episode.uuid, [dataset_folder.relative_to(data_dir()).as_posix()])
     with TemporaryDirectory() as scratch:
         placed = publish(

@@ -320,6 +320,17 @@ def test_damage_that_nobody_knows_yet_is_found_and_nothing_is_moved(old: Episode
     assert ([entry["file"] for entry in old.damage], len(videos(old))) == (["cam_high.mp4"], 3)
 
 
+def test_a_scrub_finds_the_damage_of_an_archived_recording(old: Episode, store: FolderStore) -> None:
+    put_away(old.uuid)
+    path = episode_folder(old) / "outcome.json"
+    path.write_bytes(path.read_bytes()[:-1])
+    Episode.objects.update(verified_at=None)
+    job = performed(verification.request_scrub())
+    assert job.result["damaged"] == 1, job.error
+    old.refresh_from_db()
+    assert [entry["file"] for entry in old.damage] == ["outcome.json"]
+
+
 def test_an_unrepaired_recording_is_not_moved(old: Episode, store: FolderStore) -> None:
     for name in ("outcome.json", "sealed.json"):
         os.unlink(episode_folder(old) / name)

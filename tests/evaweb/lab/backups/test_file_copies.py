@@ -162,3 +162,10 @@ def test_a_list_leads_nowhere_else(tmp_path):
         (tmp_path / "list").write_text(line.replace("PATH", path))
         with pytest.raises(BackupError, match="is not in a data folder"):
             list(read_list(tmp_path / "list"))
+
+
+def test_the_index_of_what_is_in_the_store_is_copied_after_every_recording(data, tmp_path):
+    (data / "archived").mkdir()
+    (data / "archived" / "0b7c.json").write_text("{}")
+    _, listed = copies(data, tmp_path / "copy")
+    assert listed[-1].path == "archived/0b7c.json"
