@@ -25,7 +25,7 @@ from evaweb.episodes.models import Episode
 from evaweb.jobs.kinds import JobContext
 from evaweb.jobs.models import Hold, JobStatus
 from runtime.core.durable_files import sync_folder
-from runtime.core.sentences import Pattern
+from runtime.core.sentences import Pattern, fixed
 from runtime.recording.archive_index import CAMERA_FILES, index_file, stored_files, write_index
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError, disk_error
@@ -42,6 +42,15 @@ _HERE = "here"  # folder of archived/ with one empty file per recording that was
 _DRAFTS = ".draft*"  # of a fetch that was killed
 
 _NOT_ARCHIVED = Pattern("episodes.archive.not_archived", "episode {uuid} stays as it is: {why}")
+_UNKNOWN = fixed("episodes.archive.unknown", "it does not exist in this lab")
+_NOT_CLOSED = Pattern("episodes.archive.not_closed", "it is {status}")
+_AWAY = fixed("episodes.archive.away", "it is on its station's computer")
+_DAMAGED = fixed("episodes.archive.damaged", "it is damaged")
+_IMPORTED = fixed("episodes.archive.imported", "it was imported: its dataset holds its videos")
+_OTHER_OUTCOME = fixed(
+    "episodes.archive.other_outcome", "its outcome is not the one with which it was closed"
+)
+_NO_VIDEOS = fixed("episodes.archive.no_videos", "it has no videos")
 _NO_ROOM = Pattern(
     "episodes.archive.no_room",
     "the recorded videos of episode {uuid} are in the store, and there is no room for them here: {wanted} bytes "
@@ -94,13 +103,13 @@ def _lock_names(uuid: UUID) -> list[str]:
 def why_not(episode: Episode) -> str:
     """Return why the camera files of a recording stay here, as far as its row shows it; "" if they may be moved."""
     if episode.status not in CLOSED:
-        return f"it is {episode.get_status_display()}"
+        return _NOT_CLOSED(status=episode.get_status_display())
     if episode.away_since is not None:
-        return "it is on its station's computer"
+        return _AWAY
     if episode.damage:
-        return "it is damaged"
+        return _DAMAGED
     if episode.kind == IMPORTED:
-        return "it was imported: its dataset holds its videos"
+        return _IMPORTED
     return ""
 
 
@@ -120,7 +129,7 @@ def put_away(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> int:
     """
     episode = Episode.objects.filter(uuid=uuid).first()
     if episode is None:
-        raise NotArchived(_NOT_ARCHIVED(uuid=uuid, why="it does not exist in this lab"))
+        raise NotArchived(_NOT_ARCHIVED(uuid=uuid, why=_UNKNOWN))
     if why := why_not(episode):
         raise NotArchived(_NOT_ARCHIVED(uuid=uuid, why=why))
     store, folder = required_store(), journal_folder(uuid)
@@ -152,13 +161,11 @@ def _sealed_files(episode: Episode, folder: Path) -> dict[str, str]:
     if check.state != "sound":
         raise NotArchived(_NOT_ARCHIVED(uuid=episode.uuid, why=check.text))
     if episode.seal and check.seal != episode.seal:
-        raise NotArchived(
-            _NOT_ARCHIVED(uuid=episode.uuid, why="its outcome is not the one with which it was closed")
-        )
+        raise NotArchived(_NOT_ARCHIVED(uuid=episode.uuid, why=_OTHER_OUTCOME))
     digests = read_outcome(folder)[DIGESTS]
     files = {name: entry["sha256"] for name, entry in digests.items() if name.endswith(CAMERA_FILES)}
     if not files:
-        raise NotArchived(_NOT_ARCHIVED(uuid=episode.uuid, why="it has no videos"))
+        raise NotArchived(_NOT_ARCHIVED(uuid=episode.uuid, why=_NO_VIDEOS))
     return files
 
 
