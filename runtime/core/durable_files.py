@@ -54,6 +54,26 @@ def create_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
     sync_folder(path.parent)
 
 
+@contextmanager
+def creating_durably(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """Yield a file that is at `path`, whole and durable, once the context has ended without an error.
+
+    Until then it is a draft beside; an error removes that, and the next writer reuses one left by a kill. A second
+    writer of the same path waits for the first. Raises: OSError; FileExistsError if there is a file at `path`.
+    """
+    draft = path.with_name(f".{path.name}.draft")
+    with _open_draft(draft, mode) as file:
+        try:
+            file.seek(0)  # of a draft that was reused
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            os.link(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
 def append_durably(file: FileIO, lines: bytes, sync: Callable[[int], None] | None = None) -> None:
     """Append whole lines to a file opened with "a+b" and no buffer; a torn last line is ended first.
 

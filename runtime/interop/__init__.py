@@ -1,0 +1,1 @@
+"""Files of other robotics programs: an episode as MCAP."""
