@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import secrets
@@ -68,10 +69,23 @@ def creating_durably(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            os.link(draft, path)
+            _name(draft, path)
         finally:
             draft.unlink(missing_ok=True)
     sync_folder(path.parent)
+
+
+def _name(draft: Path, path: Path) -> None:
+    """Give a draft its name. Raises: OSError; FileExistsError if there is a file of that name."""
+    try:
+        os.link(draft, path)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS):
+            raise
+        # A file system without hard links, such as that of a memory stick.
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
+        os.rename(draft, path)
 
 
 def append_durably(file: FileIO, lines: bytes, sync: Callable[[int], None] | None = None) -> None:

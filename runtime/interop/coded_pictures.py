@@ -85,6 +85,7 @@ def coded_again(video: Path, frames: int, fps: float) -> Iterator[bytes]:
     Raises RecordingError if the video cannot be decoded.
     """
     import av
+    from av.video.frame import PictureType
 
     rate = Fraction(fps).limit_denominator(1001)
     coder: Any = av.CodecContext.create("libx264", "w")
@@ -100,7 +101,7 @@ def coded_again(video: Path, frames: int, fps: float) -> Iterator[bytes]:
                     break
                 picture = frame.reformat(stream.width, stream.height, codecs.PIXELS)
                 picture.pts, picture.time_base = count, 1 / rate
-                picture.pict_type = av.video.frame.PictureType.NONE
+                picture.pict_type = PictureType.NONE
                 (packet,) = coder.encode(picture)  # options of the recorder: an encoder without delay
                 yield bytes(packet)
                 count += 1

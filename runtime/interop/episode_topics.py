@@ -133,7 +133,8 @@ def _joint_states(
         for row, stamp in enumerate(times.stamps.tolist()):
             if position[row] is None:
                 continue
-            values = {"header": to_header(stamp), "name": group.names, "position": part(position, row)}
+            values: dict[str, Any] = {"header": to_header(stamp), "name": group.names}
+            values["position"] = part(position, row)
             values |= {"velocity": part(velocity, row), "effort": part(effort, row)}
             yield Message(stamp, encode("sensor_msgs/JointState", values))
 
@@ -324,11 +325,10 @@ def _event_topics(episode: Episode, times: EpisodeTimes) -> Iterator[Topic]:
 def _events(events: Sequence[Mapping[str, Any]], stamps: Stamps) -> Iterator[Message]:
     for event, stamp in zip(events, stamps.tolist(), strict=True):
         step = event.get("step")
-        values = {"header": to_header(stamp)} | {
-            name: _text(str(event.get(name) or "")) for name in ("kind", "text", "id")
-        }
+        values: dict[str, Any] = {name: _text(str(event.get(name) or "")) for name in ("kind", "text", "id")}
         values |= {name: _json(event.get(name) or {}) for name in ("arguments", "data")}
         values |= {"step": step if isinstance(step, int) else -1, "time": _number(event.get("time"))}
+        values["header"] = to_header(stamp)
         yield Message(stamp, encode("evaweb_msgs/Event", values))
 
 
@@ -351,8 +351,8 @@ def _labels(episode: Episode, times: EpisodeTimes) -> Iterator[Message]:
     stamp = int(end.stamps[0])
     for label in read_labels(episode.path.absolute().parents[1], episode.layout.uuid):
         texts = {"by": label.by, "result": label.result or "", "note": label.note}
-        values = {"header": to_header(stamp), "time": label.time, "discarded": label.discarded}
-        values |= {name: _text(text) for name, text in texts.items()}
+        values: dict[str, Any] = {name: _text(text) for name, text in texts.items()}
+        values |= {"header": to_header(stamp), "time": label.time, "discarded": label.discarded}
         yield Message(stamp, encode("evaweb_msgs/Label", values))
 
 

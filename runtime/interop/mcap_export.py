@@ -52,6 +52,8 @@ def export_mcap(folder: Path, target: Path, pictures: Pictures = "video") -> Mca
     """
     writing = _library()
     episode = _closed_episode(folder)
+    if not target.parent.is_dir():
+        raise RecordingError(f"{target.parent} is no folder to write {target.name} to")
     if target.exists():
         raise _exists(target)
     made = episode_topics(episode, pictures)

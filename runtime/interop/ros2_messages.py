@@ -228,16 +228,16 @@ def _write(out: bytearray, kind: str, values: Mapping[str, Any]) -> None:
     for part in _FIELDS[kind]:
         value = values[part.name]
         if not part.is_sequence:
-            _write_one(out, part.kind, value)
+            _write_item(out, part.kind, value)
         elif part.kind in _SIZES:
             _write_numbers(out, part.kind, value)
         else:
             _write_number(out, "uint32", len(value))
             for item in value:
-                _write_one(out, part.kind, item)
+                _write_item(out, part.kind, item)
 
 
-def _write_one(out: bytearray, kind: str, value: Any) -> None:
+def _write_item(out: bytearray, kind: str, value: Any) -> None:
     if kind in _SIZES:
         _write_number(out, kind, value)
     elif kind == "string":

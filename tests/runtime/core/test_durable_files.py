@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
 
 import pytest
 
-from runtime.core.durable_files import AppendError, append_durably, create_durably, write_durably
+from runtime.core.durable_files import (
+    AppendError,
+    append_durably,
+    create_durably,
+    creating_durably,
+    write_durably,
+)
 
 
 def test_a_file_is_replaced_whole_and_has_the_mode_that_was_asked_for(tmp_path: Path) -> None:
@@ -29,6 +36,31 @@ def test_a_file_that_exists_is_not_created_again(tmp_path: Path) -> None:
 
     assert path.read_bytes() == b"first"
     assert [entry.name for entry in tmp_path.iterdir()] == ["key"]
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_file_written_piece_by_piece_appears_whole_and_replaces_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
+) -> None:
+    def link(draft: Path, path: Path) -> None:
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", link)
+    path = tmp_path / "long"
+    (tmp_path / ".long.draft").write_bytes(b"left by a kill, and longer")
+    with creating_durably(path) as file:
+        file.write(b"one, ")
+        assert file.tell() == 5
+        assert not path.exists()
+        file.write(b"two")
+    with pytest.raises(FileExistsError), creating_durably(path) as file:
+        file.write(b"other")
+    with pytest.raises(TypeError), creating_durably(tmp_path / "none") as file:
+        file.writelines([b"half", "no bytes"])
+
+    assert path.read_bytes() == b"one, two"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["long"]
 
 
 def test_a_full_disk_leaves_the_old_file_and_no_draft(

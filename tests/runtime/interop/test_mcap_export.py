@@ -331,6 +331,26 @@ def test_a_lost_camera_ends_where_its_video_does(tmp_path: Path) -> None:
     assert (made.topics["/cameras/front/video"], made.topics["/cameras/wrist/video"]) == (FRAMES, 5)
 
 
+@pytest.mark.parametrize("rows", [0, 1])
+def test_an_episode_in_which_nothing_happened_is_a_whole_file(tmp_path: Path, rows: int) -> None:
+    journal = EpisodeJournal(tmp_path / "data", SETTINGS)  # a folder whose labels nobody knows
+    robot = manifest()["robot"] | {"joint_names": ["a", "b.c", "d"]}
+    journal.begin(manifest(robot=robot, control_rate=None))
+    folder = journal.folder
+    assert folder is not None
+    for k in range(rows):
+        journal.append(row(k))
+    journal.end(Outcome("interrupted", "nothing", 1.7e9))
+    made = export_mcap(folder, tmp_path / "a.mcap")
+    found = messages(made.path)
+    assert {len(found[topic]) for topic in ("/robot/joint_states", "/eva/rows", "/cameras/front/video")} == {
+        rows
+    }
+    assert [list(content.name) for _, content in found["/robot/joint_states"]] == [["a", "b.c", "d"]] * rows
+    assert [content.data for _, content in found["/eva/estop"]] == [False]
+    assert made.topics["/eva/labels"] == made.topics["/eva/raw"] == 0
+
+
 # --- faults -----------------------------------------------------------------------------------------------------------
 
 
@@ -341,7 +361,7 @@ def left(folder: Path) -> list[str]:
 def test_every_fault_has_its_sentence_and_leaves_nothing(folder: Path, tmp_path: Path, capsys: Any) -> None:
     target = tmp_path / "out" / "a.mcap"
     assert main([str(folder), "--to", str(target)]) == 1
-    assert "a.mcap" in capsys.readouterr().err  # there is no such folder to write to
+    assert "is no folder to write a.mcap to" in capsys.readouterr().err
     target.parent.mkdir()
     assert main([str(tmp_path / "none"), "--to", str(target)]) == 1
     assert "is no folder of an episode" in capsys.readouterr().err
@@ -363,6 +383,20 @@ def test_a_full_disk_leaves_nothing(folder: Path, tmp_path: Path, monkeypatch: p
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DiskFullError, match="disk full while writing"):
+        export_mcap(folder, tmp_path / "a.mcap")
+    assert left(tmp_path) == []
+
+
+def test_a_disk_that_fills_midway_leaves_nothing(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mcap.writer import Writer
+
+    def full(writer: Writer, *given: Any, **named: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Writer, "add_metadata", full)
     with pytest.raises(DiskFullError, match="disk full while writing"):
         export_mcap(folder, tmp_path / "a.mcap")
     assert left(tmp_path) == []
