@@ -11,6 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from uuid import UUID
@@ -18,7 +19,7 @@ from uuid import UUID
 from django.conf import settings
 
 from evaweb.core.errors import Conflict
-from evaweb.core.object_stores import Store, StoreError, compared, fetch, required_store, the_store
+from evaweb.core.object_stores import StoreError, compared, fetch, required_store, the_store
 from evaweb.episodes.folders import archive_folder, data_dir, journal_folder
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode
@@ -28,7 +29,7 @@ from runtime.core.durable_files import sync_folder
 from runtime.core.sentences import Pattern, fixed
 from runtime.recording.archive_index import CAMERA_FILES, index_file, stored_files, write_index
 from runtime.recording.base import IMPORTED
-from runtime.recording.files import RecordingError, disk_error
+from runtime.recording.files import RecordingError, disk_error, exclusive
 from runtime.recording.outcome_seal import DIGESTS, read_outcome
 from runtime.recording.scrub import require_intact
 
@@ -116,10 +117,11 @@ def why_not(episode: Episode) -> str:
 # --- into the store ------------------------------------------------------------------------------------------
 
 
-def put_away(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> int:
+def put_away(uuid: UUID, report: Callable[[str], None] = lambda _: None, held: bool = False) -> int:
     """Move the camera files of a closed, sound recording to the store; return how many were removed here.
 
-    It may be ended at any moment and run again. An index that exists is never changed.
+    It may be ended at any moment and run again. An index that exists is never changed. Unless the caller is the job
+    that holds the recording (`held`), files that a job reads by then stay, as if they had been brought back for it.
 
     Raises:
         NotArchived: The recording may not be moved.
@@ -147,7 +149,12 @@ def put_away(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> int:
     elif any((folder / name).exists() for name in files):
         for digest in files.values():
             compared(store, digest)
-    removed = _remove(uuid, files)
+    with exclusive(_mark(uuid).parent):
+        if held or not is_in_use(uuid):
+            removed = _remove(uuid, files)
+        else:
+            removed = 0
+            _mark(uuid).touch()
     Episode.objects.filter(uuid=uuid).update(archived_at=archived_at(uuid))
     return removed
 
@@ -179,7 +186,8 @@ def _remove(uuid: UUID, files: dict[str, str]) -> int:
                 removed += 1
         for draft in folder.glob(_DRAFTS):
             draft.unlink(missing_ok=True)
-        sync_folder(folder)
+        if folder.is_dir():  # else somebody has removed the whole recording
+            sync_folder(folder)
         _mark(uuid).unlink(missing_ok=True)
     except OSError as error:
         raise disk_error("removing what is in the store from", folder, error) from error
@@ -201,10 +209,10 @@ def bring_back(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> in
     files, folder = archived_files(uuid), journal_folder(uuid)
     if not files or not folder.is_dir():
         return 0
-    absent = {name: digest for name, digest in files.items() if not (folder / name).exists()}
     try:
-        _mark(uuid).parent.mkdir(parents=True, exist_ok=True)
-        _mark(uuid).touch()  # before the files: whatever was brought is removed again some day
+        with exclusive(_mark(uuid).parent):  # what is here now stays
+            _mark(uuid).touch()  # before the files: whatever was brought is removed again some day
+            absent = {name: digest for name, digest in files.items() if not (folder / name).exists()}
         if absent:
             store = required_store()
             remove_unused(besides=uuid)
@@ -212,6 +220,7 @@ def bring_back(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> in
             for number, (name, digest) in enumerate(absent.items(), 1):
                 report(f"video {number} of {len(absent)} from the store")
                 fetch(store, digest, folder / name)
+                _mark(uuid).touch()
     except OSError as error:
         raise disk_error("bringing back", folder, error) from error
     return len(absent)
@@ -221,42 +230,55 @@ def remove_unused(now: float | None = None, besides: UUID | None = None) -> int:
     """Remove files that were brought back and not used for an hour, oldest first; return the number of recordings.
 
     While they have more than EVA_CACHE_BYTES, ten minutes are enough. Files that a running job reads stay, and so do
-    those that the store lacks or does not answer about: these are looked at again after an hour. At most _AT_ONCE
-    recordings are removed per call.
+    those that the store does not give back as they were, or that the disk does not let go: these are looked at again
+    after an hour. At most _AT_ONCE recordings are looked at per call.
 
     Args:
         now: Time [Unix s], None for the present.
         besides: Recording that is not counted, and stays.
     """
-    store = the_store()
-    if store is None:
+    if the_store() is None:
         return 0
     now = time.time() if now is None else now
     marks = sorted((used, uuid, _local_bytes(uuid)) for used, uuid in _marks() if uuid != besides)
-    size, removed = sum(own for _, _, own in marks), 0
+    size, removed, tried = sum(own for _, _, own in marks), 0, 0
     for used, uuid, own in marks:
         enough = UNUSED_S if size <= settings.EVA_CACHE_BYTES else _IN_USE_S
-        if now - used < enough or removed >= _AT_ONCE:
+        if now - used < enough or tried >= _AT_ONCE:
             break
         if is_in_use(uuid):
             continue
-        if why := _removal_obstacle(store, uuid):
-            log.warning("the videos of episode %s stay here: %s", uuid, why)
-            os.utime(_mark(uuid), (now, now))
+        tried += 1
+        try:
+            done = _remove_again(uuid, used)
+        except (
+            StoreError,
+            RecordingError,
+        ) as error:  # of this recording alone: it must not keep the others here
+            log.warning("the videos of episode %s stay here: %s", uuid, error)
+            with suppress(FileNotFoundError):  # another worker has removed them
+                os.utime(_mark(uuid), (now, now))
             continue
-        _remove(uuid, archived_files(uuid))
-        size -= own
-        removed += 1
+        if done:
+            size -= own
+            removed += 1
     return removed
 
 
-def _removal_obstacle(store: Store, uuid: UUID) -> str:
-    """Return why local files must not be removed: the store lacks one, or does not answer; "" if they may be."""
-    try:
-        absent = [name for name, digest in archived_files(uuid).items() if not store.exists(digest)]
-    except (StoreError, RecordingError) as error:
-        return str(error)
-    return f"the store has no {', '.join(absent)}" if absent else ""
+def _remove_again(uuid: UUID, used: float) -> bool:
+    """Remove what was brought back after the store's copies were compared; return False if it is used again meanwhile.
+
+    `used` is the time of its last use [Unix s]. Raises: StoreError, RecordingError.
+    """
+    store, files, folder = required_store(), archived_files(uuid), journal_folder(uuid)
+    for name, digest in files.items():
+        if (folder / name).exists():
+            compared(store, digest)
+    with exclusive(_mark(uuid).parent):
+        if is_in_use(uuid) or (used, uuid) not in _marks():
+            return False
+        _remove(uuid, files)
+    return True
 
 
 def _require_room(uuid: UUID, folder: Path, absent: dict[str, str]) -> None:
@@ -290,4 +312,8 @@ def _marks() -> Iterator[tuple[float, UUID]]:
 
 
 def _local_bytes(uuid: UUID) -> int:
-    return sum(path.stat().st_size for path in journal_folder(uuid).glob(f"*{CAMERA_FILES}"))
+    size = 0
+    for path in journal_folder(uuid).glob(f"*{CAMERA_FILES}"):
+        with suppress(FileNotFoundError):  # another worker has removed it
+            size += path.stat().st_size
+    return size

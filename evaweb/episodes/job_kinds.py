@@ -69,7 +69,7 @@ def archive_recording(work: JobContext) -> Mapping[str, Any]:
     uuid = UUID(work.args["uuid"])
     lock_recording(work, uuid)
     try:
-        return {"archived": True, "removed": put_away(uuid, work.report_progress)}
+        return {"archived": True, "removed": put_away(uuid, work.report_progress, held=True)}
     except NotArchived as refused:
         return {"archived": False, "why": str(refused)}
     except DamagedError as error:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 from django.contrib.auth.models import User
@@ -31,11 +34,12 @@ from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.poses import pose_message
 from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.smoothness import smoothness_in
-from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.models import Hold, Job, JobStatus
 from evaweb.jobs.services import enqueue, run_queue
 from evaweb.reviews.record import report_file
 from evaweb.reviews.services import request_quality_check
 from runtime.recording.__main__ import main
+from runtime.recording.archive_index import write_index
 from runtime.recording.files import RecordingError
 from runtime.recording.quarantine import marked_damage
 from runtime.recording.reader import open_episode
@@ -380,3 +384,70 @@ def test_days_without_a_store_end_the_start_with_a_sentence(monkeypatch: pytest.
     monkeypatch.setenv("EVA_ARCHIVE_DAYS", "-1")
     with pytest.raises(ImproperlyConfigured, match="days from 0"):
         environment.archive_days("EVA_ARCHIVE_DAYS", True)
+
+
+def test_a_recording_whose_folder_is_gone_does_not_keep_the_others_from_coming_back(
+    old: Episode, store: FolderStore
+) -> None:
+    put_away(old.uuid)
+    gone = archive_folder() / "here" / str(uuid4())
+    gone.touch()
+    os.utime(gone, (1.0, 1.0))
+    assert bring_back(old.uuid) == 3
+    assert not gone.exists()
+
+
+def test_a_disk_that_keeps_the_files_of_one_recording_is_asked_again_after_an_hour(
+    old: Episode, store: FolderStore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    put_away(old.uuid)
+    bring_back(old.uuid)
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    later = time.time() + 3700
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        assert remove_unused(later) == 0
+    assert "Permission denied" in caplog.text
+    assert [remove_unused(later + age) for age in (3599, 3601)] == [0, 1]
+
+
+def test_files_stay_if_the_store_has_another_content_or_a_job_begins_meanwhile(
+    old: Episode, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_away(old.uuid)
+    bring_back(old.uuid)
+    later = time.time() + 3700
+    path = store.file(next(iter(archive.archived_files(old.uuid).values())))
+    assert path is not None
+    whole = path.read_bytes()
+    path.write_bytes(b"")
+    assert (remove_unused(later), len(videos(old))) == (0, 3)
+    path.write_bytes(whole)
+
+    def begin(*given: object) -> None:
+        bring_back(old.uuid)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "compared", begin)
+        assert (remove_unused(later + 3601), len(videos(old))) == (0, 3)
+    assert remove_unused(later + 2 * 3601) == 1
+
+
+def test_the_command_leaves_files_that_a_job_has_begun_to_read(
+    old: Episode, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def begin(*given: Any) -> None:
+        job = Job.objects.create(kind="quality", key="quality", status=JobStatus.RUNNING, owner=uuid4())
+        Hold.objects.create(what=f"episodes/{old.uuid}", job=job, owner=job.owner)
+        write_index(*given)
+
+    monkeypatch.setattr(archive, "write_index", begin)
+    out = io.StringIO()
+    call_command("archive", str(old.uuid), stdout=out)
+    assert (len(videos(old)), index(old).exists()) == (3, True)
+    Job.objects.filter(kind="quality").delete()
+    assert remove_unused(time.time() + 3700) == 1
+    assert videos(old) == []
