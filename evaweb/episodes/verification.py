@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime, timedelta
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -37,6 +38,7 @@ OLD_AFTER = timedelta(hours=1)  # a new recording is verified at its publication
 LATE_AFTER = timedelta(days=1)
 _PAUSE = timedelta(hours=1)  # after a failed job
 _ARCHIVED_AT_ONCE = 5
+_MOST_FAILED = 3  # in a row; then the store is away, and it is not a recording that it has lost
 MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # limits per job, because other jobs wait meanwhile
 
 
@@ -53,7 +55,8 @@ def request_scrub() -> Job | None:
 def request_archives() -> list[Job]:
     """Queue the move of a few old recordings to the lab's store if the workers are idle; return the jobs.
 
-    Each is asked for again only a month after a job has left it as it is. After a job has failed, none is for an hour.
+    Each is asked for again only a month after a job has left it as it is or was cancelled, and a day after one has
+    failed. After a job has failed, none is for an hour.
     """
     if settings.EVA_ARCHIVE_DAYS is None or _anything_queued() or _failed_lately("archive"):
         return []
@@ -62,16 +65,20 @@ def request_archives() -> list[Job]:
     here = Episode.objects.filter(status__in=CLOSED, damage=[], away_since=None, archived_at=None)
     rows = here.filter(previewed_at__isnull=False, verified_at__isnull=False, started_at__lt=limit)
     rows = rows.exclude(kind=IMPORTED).exclude(seal="")
-    asked = Job.objects.filter(kind="archive", finished_at__gt=now - AGAIN_AFTER)
-    uuids = []
-    for uuid in rows.order_by("started_at").values_list("uuid", flat=True)[:MOST_EPISODES]:
-        if (
-            len(uuids) < _ARCHIVED_AT_ONCE
-            and not asked.filter(key=f"archive:{uuid}").exists()
-            and _closed_before(uuid, limit)
-        ):
-            uuids.append(uuid)
-    return [request_archive(uuid=uuid) for uuid in uuids]
+    uuids = rows.order_by("started_at").values_list("uuid", flat=True)
+    asked = _asked(now)
+    # Those that stay must not hide the ones behind them.
+    waiting = islice((uuid for uuid in uuids if f"archive:{uuid}" not in asked), MOST_EPISODES)
+    old = (uuid for uuid in waiting if _closed_before(uuid, limit))
+    return [request_archive(uuid=uuid) for uuid in list(islice(old, _ARCHIVED_AT_ONCE))]
+
+
+def _asked(now: datetime) -> set[str]:
+    """Return the keys of jobs that have not archived their recording, and need not be asked for again yet."""
+    left = Q(status=JobStatus.DONE, result__archived=False) | Q(cancelled_by__isnull=False)
+    failed = Q(status=JobStatus.FAILED, finished_at__gt=now - LATE_AFTER)
+    jobs = Job.objects.filter(kind="archive", finished_at__gt=now - AGAIN_AFTER)
+    return set(jobs.filter(left | failed).values_list("key", flat=True))
 
 
 def _closed_before(uuid: UUID, limit: datetime) -> bool:
@@ -94,27 +101,31 @@ def _failed_lately(kind: str) -> bool:
 def scrub_due(work: JobContext) -> Mapping[str, Any]:
     """Verify the next due recordings and store each result immediately.
 
-    Camera files that are in the lab's store are brought back for it. After the store has failed once, other archived
-    recordings wait.
+    Camera files that are in the lab's store are brought back for it. After the store has failed for several
+    recordings in a row, other archived recordings wait.
 
     Returns: Number of recordings by result.
     Raises: StoreError or RecordingError after all others, if videos could not be brought back.
     """
     archived = bool(work.args.get("archived", True))
     failed: Exception | None = None
+    in_a_row = 0
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
     for uuid in _next(archived):
         if read >= MOST_BYTES:
             break
-        if failed is not None and archived_at(uuid) is not None:
+        is_archived = archived_at(uuid) is not None
+        if is_archived and in_a_row >= _MOST_FAILED:
             continue
         work.report_progress(f"{sum(counts.values())} verified, {len(damaged)} damaged")
         try:
             use_videos(work, uuid)
         except (StoreError, RecordingError) as error:
             failed = error
+            in_a_row += isinstance(error, StoreError)
             continue
+        in_a_row = 0 if is_archived else in_a_row
         try:
             verdict = record_verification(_verify_folder(journal_folder(uuid)))
         except RecordingError as error:

@@ -451,3 +451,47 @@ def test_the_command_leaves_files_that_a_job_has_begun_to_read(
     Job.objects.filter(kind="quality").delete()
     assert remove_unused(time.time() + 3700) == 1
     assert videos(old) == []
+
+
+def test_a_move_that_failed_is_asked_for_again_after_a_day_and_hides_no_other(
+    old: Episode, store: FolderStore, settings: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings.EVA_ARCHIVE_DAYS = 0.0
+    job = services.request_archive(uuid=old.uuid)
+    failed = Job.objects.filter(pk=job.pk)
+    failed.update(status=JobStatus.FAILED, finished_at=timezone.now() - timedelta(hours=2))
+    assert find_archivable() == 0
+    monkeypatch.setattr(verification, "MOST_EPISODES", 1)
+    other = uuid4()
+    fields = Episode.objects.filter(pk=old.pk).values().get()
+    Episode.objects.create(**{**fields, "uuid": other, "started_at": timezone.now() - WEEK})
+    Episode.objects.filter(pk=old.pk).update(started_at=timezone.now() - 2 * WEEK)
+    monkeypatch.setattr(verification, "_closed_before", lambda uuid, limit: True)
+    assert [job.key for job in verification.request_archives()] == [f"archive:{other}"]
+    Job.objects.exclude(pk=job.pk).delete()
+    failed.update(finished_at=timezone.now() - timedelta(hours=25))
+    assert [job.key for job in verification.request_archives()] == [f"archive:{old.uuid}"]
+    Job.objects.exclude(pk=job.pk).delete()
+    failed.update(status=JobStatus.DONE, result={"archived": False})
+    assert [job.key for job in verification.request_archives()] == [f"archive:{other}"]
+
+
+@pytest.mark.parametrize("lost", ["an object", "its index"])
+def test_a_scrub_goes_on_behind_a_recording_that_does_not_come_back(
+    old: Episode, store: FolderStore, closed: Callable[..., Episode], lost: str
+) -> None:
+    other = closed("interrupted")
+    run_queue("cpu")
+    for episode in (old, other):
+        put_away(episode.uuid)
+    named = json.dumps({"files": {"cam_high.mp4": "0" * 64}})
+    index(old).write_text("{" if lost == "its index" else named)
+    Episode.objects.update(created_at=timezone.now() - WEEK, verified_at=timezone.now() - 9 * WEEK)
+    Episode.objects.filter(pk=old.pk).update(verified_at=timezone.now() - 10 * WEEK)
+    job = performed(verification.request_scrub())
+    assert (job.status, bool(job.error)) == (JobStatus.QUEUED, True)
+    other.refresh_from_db()
+    assert other.verified_at is not None
+    assert other.verified_at > timezone.now() - WEEK
+    old.refresh_from_db()
+    assert (old.damage, old.verified_at is not None) == ([], True)
