@@ -7,6 +7,7 @@ from uuid import UUID
 
 from django.db import Error, close_old_connections
 
+from evaweb.core.object_stores import StoreError, compared, required_store
 from evaweb.episodes import services
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.models import Episode
@@ -38,6 +39,14 @@ def owner_of(uuid: str) -> str:
         raise OSError(str(error)) from error
     finally:
         close_old_connections()
+
+
+def read_back(digest: str) -> None:
+    """Read an object of the lab's store. Raises: OSError if it is absent or another one."""
+    try:
+        compared(required_store(), digest)
+    except StoreError as error:
+        raise OSError(str(error)) from error
 
 
 def whereabouts(episode: Episode) -> str:

@@ -26,7 +26,7 @@ from runtime.ipc.bus import TransportError
 from runtime.link import key_files
 from runtime.link.admission import Allowed, AllowList
 from runtime.link.gate import Gate
-from runtime.link.incoming import Incoming, Owner
+from runtime.link.incoming import Incoming, Owner, ReadBack
 from runtime.link.key_files import ConfigurationError
 from runtime.link.wire import Enrolled
 from runtime.recording.files import write_atomic
@@ -91,17 +91,17 @@ class Keys:
         return Allowed()
 
 
-def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
+def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner, read_back: ReadBack) -> None:
     """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; print the address as JSON.
 
     `where` is the host to listen on and its two ports; port 0 chooses a free port. `owner` returns the name of the
-    station that owns an offered episode.
+    station that owns an offered episode, and `read_back` reads a file that is in the lab's store alone.
 
     Raises: GateError.
     """
     try:
         with _lock_gate(key_files.folder(settings.DATA_DIR) / "gate.lock"):
-            _serve(where, lifeline, owner)
+            _serve(where, lifeline, owner, read_back)
     except (TransportError, ConfigurationError) as fault:
         raise GateError(str(fault)) from None
 
@@ -124,7 +124,7 @@ def _lock_gate(path: Path) -> Iterator[None]:
         yield
 
 
-def _serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
+def _serve(where: tuple[str, int, int], lifeline: bool, owner: Owner, read_back: ReadBack) -> None:
     logs.configure_logging("gate")
     process_limits.raise_file_limit()
     sys.setswitchinterval(_TURN_S)
@@ -134,7 +134,7 @@ def _serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
         signal.signal(number, lambda number, frame: ended.set())
     keys = Keys(data)
     tokens = key_files.tokens_key(data)
-    incoming = Incoming(data, owner, settings.EVA_RESERVE_BYTES)
+    incoming = Incoming(data, owner, settings.EVA_RESERVE_BYTES, read_back)
     enrol = _enroller(keys, tokens)
     gate = Gate(data, key_files.lab_key(data), tokens, keys.list, enrol, where, incoming=incoming)
     threading.Thread(target=keys.follow, args=(ended,), name="keys", daemon=True).start()

@@ -43,6 +43,12 @@ _MOST_TRIES = 3  # per file whose content differs from the list
 _SOON_S, _LATER_S, _NEVER_S = 60.0, 600.0, 86400.0  # [s], until the station may offer it again
 Owner = Callable[[str], str]
 """Called with an episode's uuid; returns its station's name, "" if unknown. Raises: OSError if the lookup fails."""
+ReadBack = Callable[[str], None]
+"""Called with a SHA-256; reads that object of the lab's store. Raises: OSError if it is absent or another one."""
+
+
+def _unread(digest: str) -> None:
+    raise OSError(f"this program does not read the store, which should have {digest}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +93,10 @@ class Incoming:
     The event descriptor `wake` becomes readable when `answers` has messages to send.
     """
 
-    def __init__(self, data: Path, owner: Owner, reserve: int = RESERVE) -> None:
-        self._data, self._owner, self._reserve = data, owner, reserve
+    def __init__(
+        self, data: Path, owner: Owner, reserve: int = RESERVE, read_back: ReadBack = _unread
+    ) -> None:
+        self._data, self._owner, self._reserve, self._read_back = data, owner, reserve, read_back
         self._desks: dict[str, _Desk] = {}
         self._answers: SimpleQueue[tuple[bytes, Message]] = SimpleQueue()
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -96,7 +104,8 @@ class Incoming:
     def handle(self, station: str, route: bytes, message: Message, part: bytes) -> None:
         """Pass a station's message about an episode to the thread of that station."""
         if station not in self._desks:
-            self._desks[station] = _Desk(Shelf(self._data, station, self._owner, self._reserve), self._send)
+            shelf = Shelf(self._data, station, self._owner, self._reserve, self._read_back)
+            self._desks[station] = _Desk(shelf, self._send)
         self._desks[station].put(route, message, part)
 
     def left(self, station: str, route: bytes) -> None:
@@ -203,9 +212,16 @@ class _Unwanted(Exception):
 class Shelf:
     """Disk storage for the episodes that one station sends. One thread uses it."""
 
-    def __init__(self, data: Path, station: str, owner: Owner, reserve: int = RESERVE) -> None:
+    def __init__(
+        self,
+        data: Path,
+        station: str,
+        owner: Owner,
+        reserve: int = RESERVE,
+        read_back: ReadBack = _unread,
+    ) -> None:
         self.station = station
-        self._data, self._owner, self._reserve = data, owner, reserve
+        self._data, self._owner, self._reserve, self._read_back = data, owner, reserve, read_back
         self._episodes = data / "episodes"
         self._root = self._episodes / ARRIVING / station
         self._begun: _Begun | None = None
@@ -342,13 +358,25 @@ class Shelf:
         return self._arrived(episode, contents)
 
     def _existing(self, episode: str, contents: Contents) -> Contents:
-        """Return the files of an episode that the lab has, with those of `contents` that are in its store alone."""
+        """Return the files of an episode that the lab has, with those of `contents` that are in its store alone.
+
+        These are read back from there, as the others are read here: the station may remove its copy at the answer.
+
+        Raises: _Unwanted, which declines the offer, if the store does not give them.
+        """
         folder = self._episodes / episode
         here, stored = contents_of(folder), stored_files(folder)
         names = {file.name for file in here.files}
         away = [
             file for file in contents.files if file.name not in names and stored.get(file.name) == file.sha256
         ]
+        for file in away:
+            try:
+                self._read_back(file.sha256)
+            except OSError as error:
+                raise _Unwanted(
+                    f"{file.name} is in the lab's store, which does not give it: {error}", _LATER_S
+                ) from None
         return Contents(tuple(sorted((*here.files, *away), key=lambda file: file.name)))
 
     def _arrived(self, episode: str, contents: Contents) -> Message:

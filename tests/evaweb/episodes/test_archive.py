@@ -26,6 +26,7 @@ from evaweb.core.object_stores import FolderStore, StoreError
 from evaweb.datasets.robot_replay import playable_episode
 from evaweb.episodes import archive, services, verification
 from evaweb.episodes.archive import NotArchived, bring_back, put_away, remove_unused
+from evaweb.episodes.arriving import read_back
 from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curve_message
 from evaweb.episodes.folders import archive_folder, journal_folder
@@ -194,6 +195,15 @@ def test_another_file_than_the_index_names_is_refused_and_nothing_of_it_can_be_s
     with pytest.raises(StoreError, match="is not what its name says"):
         bring_back(old.uuid)
     assert {path.suffix for path in episode_folder(old).iterdir()} <= {".arrow", ".json", ".jsonl"}
+
+
+def test_what_a_station_offers_again_is_read_back_from_the_store(old: Episode, store: FolderStore) -> None:
+    put_away(old.uuid)
+    digest = archive.archived_files(old.uuid)["cam_high.mp4"]
+    read_back(digest)
+    store.delete(digest)
+    with pytest.raises(OSError, match="does not give"):
+        read_back(digest)
 
 
 def test_a_store_that_took_something_else_leaves_every_file_here(

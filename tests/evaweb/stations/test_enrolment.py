@@ -203,4 +203,4 @@ def test_a_second_gate_of_a_data_folder_does_not_start(tmp_path):
         first.flush()
         fcntl.flock(first, fcntl.LOCK_EX)
         with pytest.raises(gate.GateError, match=r"is already running \(process 4711\): end it first"):
-            gate.serve(("127.0.0.1", 0, 0), False, lambda uuid: "")
+            gate.serve(("127.0.0.1", 0, 0), False, lambda uuid: "", lambda digest: None)

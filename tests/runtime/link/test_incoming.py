@@ -113,7 +113,14 @@ def test_one_that_is_here_with_other_content_is_refused_by_name_and_stays(data, 
     assert content(data / "episodes" / UUID) == before
 
 
-def test_one_whose_videos_the_lab_has_in_its_store_has_arrived(data, shelf, home):
+def test_one_whose_videos_the_lab_has_in_its_store_has_arrived_if_the_store_gives_them(data, home):
+    lost = []
+
+    def read_back(digest):
+        if digest in lost:
+            raise OSError("it is lost")
+
+    shelf = Shelf(data, STATION, lambda uuid: "", reserve=0, read_back=read_back)
     sent(shelf, home, offered(shelf, home))
     video = data / "episodes" / UUID / "front.mp4"
     digest = hashlib.sha256(video.read_bytes()).hexdigest()
@@ -121,6 +128,9 @@ def test_one_whose_videos_the_lab_has_in_its_store_has_arrived(data, shelf, home
     write_index(data, UUID, {"front.mp4": digest})
     (answer,) = offered(shelf, home)
     assert isinstance(answer, Arrived)
+    lost.append(digest)
+    assert why(offered(shelf, home)) == "front.mp4 is in the lab's store, which does not give it: it is lost"
+    assert "does not read the store" in why(offered(Shelf(data, STATION, lambda uuid: "", reserve=0), home))
     write_index(data, UUID, {"front.mp4": "0" * 64})
     assert "with other content (front.mp4)" in why(offered(shelf, home))
 

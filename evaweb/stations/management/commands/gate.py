@@ -32,12 +32,12 @@ class Command(BaseCommand):
     def handle(
         self, *args: Any, host: str, port: int, second_port: int | None, lifeline: bool, **options: Any
     ) -> None:
-        from evaweb.episodes.arriving import owner_of  # imports models, which need loaded apps
+        from evaweb.episodes.arriving import owner_of, read_back  # imports models, which need loaded apps
         from evaweb.stations import gate
 
         if second_port is None:
             second_port = port + 1 if port else 0
         try:
-            gate.serve((host, port, second_port), lifeline, owner_of)
+            gate.serve((host, port, second_port), lifeline, owner_of, read_back)
         except gate.GateError as fault:
             raise CommandError(str(fault)) from None
