@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeGuard
 
 from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
@@ -31,11 +32,11 @@ def stored_files(folder: Path) -> dict[str, str]:
     Raises RecordingError if the index cannot be read.
     """
     data = data_of(folder)
-    path = index_file(data, folder.name) if data else None
-    if path is None or not path.exists():
+    path = index_file(data, folder.absolute().name) if data else None
+    if path is None or not _is_there(path):
         return {}
     files = read_json(path).get("files")
-    if not isinstance(files, dict) or not all(map(_is_entry, files.items())):
+    if not _are_entries(files):
         raise RecordingError(
             f"{path} does not say which files of the recording are in the store: bring it back from a backup"
         )
@@ -43,8 +44,16 @@ def stored_files(folder: Path) -> dict[str, str]:
 
 
 def write_index(data: Path, uuid: str, files: Mapping[str, str]) -> None:
-    """Write a recording's index so that it survives a power cut. Raises RecordingError."""
+    """Write a recording's index so that it survives a power cut.
+
+    Raises RecordingError, also for files that `stored_files` would not accept.
+    """
     path = index_file(data, uuid)
+    if not _are_entries(dict(files)):
+        raise RecordingError(
+            f"{path} cannot name {', '.join(map(repr, files)) or 'no files'}: allowed are names of videos in the "
+            f"recording's own folder, *{CAMERA_FILES}, with their SHA-256"
+        )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         sync_folder(data)
@@ -55,10 +64,26 @@ def write_index(data: Path, uuid: str, files: Mapping[str, str]) -> None:
 
 def require_not_stored(path: Path) -> None:
     """Raise RecordingError with the way to bring it back if the file, which is absent, is in the lab's store."""
-    if path.name in stored_files(path.parent):
+    folder = path.absolute().parent
+    if path.name in stored_files(folder):
         raise RecordingError(
-            f"{path} is in the lab's store (EVA_STORE): manage.py archive --back {path.parent.name} brings it back"
+            f"{path} is in the lab's store (EVA_STORE): manage.py archive --back {folder.name} brings it back"
         )
+
+
+def _is_there(path: Path) -> bool:
+    """Return True unless the file is absent; a file that may not be looked at is there, and cannot be read."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise disk_error("looking at", path, error) from error
+    return True
+
+
+def _are_entries(files: object) -> TypeGuard[dict[str, str]]:
+    return isinstance(files, dict) and bool(files) and all(map(_is_entry, files.items()))
 
 
 def _is_entry(entry: tuple[object, object]) -> bool:

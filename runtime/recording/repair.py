@@ -11,6 +11,7 @@ from typing import Literal
 
 from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
+from runtime.recording.archive_index import require_not_stored
 from runtime.recording.base import VIDEO_LOST
 from runtime.recording.damage_marks import data_of
 from runtime.recording.episode import lock_folder
@@ -115,6 +116,10 @@ def _judge(path: Path) -> RepairReport:
         check = verify_episode(path)
         if check.state != "open" or (path / OUTCOME_COPY).exists():
             return _closed(path, check)
+        for camera in layout.cameras:
+            # Without a video that is in the lab's store, every row would be cut.
+            if not (video := path / f"{camera}.mp4").exists():
+                require_not_stored(video)
     except RecordingError as error:
         return RepairReport(path, "unreadable", str(error))
     return _complete(path, layout)

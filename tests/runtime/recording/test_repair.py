@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from runtime.core.errors import RecordingError
 from runtime.recording import repair as repair_module
+from runtime.recording.archive_index import write_index
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.export import write_export
@@ -53,6 +54,18 @@ def contents(folder: Path) -> dict[str, bytes]:
 def cut(path: Path, size: int) -> None:
     with open(path, "r+b") as file:
         file.truncate(size)
+
+
+def test_no_row_is_cut_because_the_videos_are_in_the_store(unfinished: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(unfinished, tmp_path / "episodes" / unfinished.name))
+    videos = [folder / f"{camera}.mp4" for camera in CAMERAS]
+    write_index(tmp_path, folder.name, {video.name: "ab" * 32 for video in videos})
+    for video in videos:
+        video.unlink()
+    before = contents(folder)
+    report = repair(folder)
+    assert (report.verdict, f"archive --back {folder.name}" in report.problem) == ("unreadable", True)
+    assert contents(folder) == before
 
 
 def test_an_episode_that_only_lacks_its_outcome_loses_nothing(folder: Path) -> None:
