@@ -52,6 +52,10 @@ _OTHER_OUTCOME = fixed(
     "episodes.archive.other_outcome", "its outcome is not the one with which it was closed"
 )
 _NO_VIDEOS = fixed("episodes.archive.no_videos", "it has no videos")
+_OTHER_FILES = Pattern(
+    "episodes.archive.other_files",
+    "the files of episode {uuid} stay here: {name} is in the store with another SHA-256 than its outcome says",
+)
 _NO_ROOM = Pattern(
     "episodes.archive.no_room",
     "the recorded videos of episode {uuid} are in the store, and there is no room for them here: {wanted} bytes "
@@ -177,8 +181,17 @@ def _sealed_files(episode: Episode, folder: Path) -> dict[str, str]:
 
 
 def _remove(uuid: UUID, files: dict[str, str]) -> int:
-    """Remove local files that the store has, with drafts and the mark of their use; return the number of files."""
+    """Remove local files that the store has, with drafts and the mark of their use; return the number of files.
+
+    Raises: RecordingError if the disk refuses it, or if the index is of other files than those that were recorded.
+    """
     folder, removed = journal_folder(uuid), 0
+    recorded = (
+        read_outcome(folder).get(DIGESTS, {}) if any((folder / name).exists() for name in files) else {}
+    )
+    for name in recorded.keys() & files.keys():
+        if recorded[name]["sha256"] != files[name]:
+            raise RecordingError(_OTHER_FILES(uuid=uuid, name=name))
     try:
         for name in files:
             if (folder / name).exists():
@@ -224,6 +237,21 @@ def bring_back(uuid: UUID, report: Callable[[str], None] = lambda _: None) -> in
     except OSError as error:
         raise disk_error("bringing back", folder, error) from error
     return len(absent)
+
+
+def bring_again(uuid: UUID, names: Collection[str]) -> bool:
+    """Replace local copies of files that are in the store, because they were found changed; return True if any is.
+
+    Raises: StoreError, RecordingError, as `bring_back`.
+    """
+    folder = journal_folder(uuid)
+    files = {name: digest for name, digest in archived_files(uuid).items() if name in names}
+    try:
+        for name, digest in files.items():
+            fetch(required_store(), digest, folder / name)
+    except OSError as error:
+        raise disk_error("bringing back", folder, error) from error
+    return bool(files)
 
 
 def remove_unused(now: float | None = None, besides: UUID | None = None) -> int:

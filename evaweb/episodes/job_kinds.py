@@ -31,7 +31,6 @@ from runtime.recording.export import write_export
 from runtime.recording.files import RecordingError
 from runtime.recording.integrity import DamagedError
 from runtime.recording.labels import latest_label
-from runtime.recording.scrub import verify_episode
 
 _AT_ONCE = 20  # jobs queued per call of a periodic task
 
@@ -147,7 +146,7 @@ def publish_episode(work: JobContext) -> Mapping[str, Any]:
         return _published(work, episode, folder)
     except RecordingError:
         use_videos(work, episode.uuid)
-        verdict = verification.compare_with_row(episode, verify_episode(folder))
+        verdict = verification.compare_with_row(episode, verification.verify_with_store(episode.uuid))
         if verdict.state != "damaged":
             raise
         verification.record_verification(verdict)

@@ -16,7 +16,7 @@ from django.db.models import F, Q, QuerySet
 from django.utils import timezone
 
 from evaweb.core.object_stores import StoreError
-from evaweb.episodes.archive import archived_at, use_videos
+from evaweb.episodes.archive import archived_at, bring_again, use_videos
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.manifest import CLOSED, read_recorded_episode
 from evaweb.episodes.models import Episode
@@ -127,7 +127,11 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
             continue
         in_a_row = 0 if is_archived else in_a_row
         try:
-            verdict = record_verification(_verify_folder(journal_folder(uuid)))
+            verdict = record_verification(verify_with_store(uuid))
+        except StoreError as error:
+            failed = error
+            in_a_row += 1
+            continue
         except RecordingError as error:
             problems.append(str(error))
             Episode.objects.filter(uuid=uuid).update(verified_at=timezone.now())
@@ -173,6 +177,18 @@ def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
     if not reason:
         return verdict
     return replace(verdict, state="damaged", damage=(Damage(OUTCOME, reason),), seal=row.seal)
+
+
+def verify_with_store(uuid: UUID) -> IntegrityCheck:
+    """Verify a recording whose videos are here; a changed copy of a file in the store is replaced, and is no damage.
+
+    Raises: RecordingError; StoreError if the store does not give the file.
+    """
+    folder = journal_folder(uuid)
+    verdict = _verify_folder(folder)
+    if bring_again(uuid, [damage.file for damage in verdict.damage]):
+        verdict = _verify_folder(folder)
+    return verdict
 
 
 def _verify_folder(folder: Path) -> IntegrityCheck:

@@ -345,6 +345,35 @@ def test_a_scrub_finds_the_damage_of_an_archived_recording(old: Episode, store: 
     assert [entry["file"] for entry in old.damage] == ["outcome.json"]
 
 
+@pytest.mark.parametrize("kind", ["scrub", "publish"])
+def test_a_copy_that_changed_after_it_was_brought_back_is_no_damage(
+    old: Episode, store: FolderStore, kind: str
+) -> None:
+    put_away(old.uuid)
+    bring_back(old.uuid)
+    videos(old)[0].write_bytes(b"another")
+    Episode.objects.update(verified_at=None)
+    job = performed(
+        verification.request_scrub() if kind == "scrub" else services.request_publish(episode=old)
+    )
+    assert job.result.get("found", []) == []
+    old.refresh_from_db()
+    assert (old.damage, verify_episode(episode_folder(old)).state) == ([], "sound")
+
+
+def test_nothing_is_removed_by_an_index_of_other_files(old: Episode, store: FolderStore) -> None:
+    put_away(old.uuid)
+    bring_back(old.uuid)
+    earlier = store.folder / "earlier.mp4"
+    earlier.write_bytes(b"another")
+    named = {"cam_high.mp4": store.put(earlier, "video/mp4")}
+    index(old).write_text(json.dumps({"files": named}))
+    with pytest.raises(RecordingError, match=r"cam_high\.mp4 is in the store with another SHA-256"):
+        put_away(old.uuid)
+    assert remove_unused(time.time() + 3700) == 0
+    assert len(videos(old)) == 3
+
+
 def test_an_unrepaired_recording_is_not_moved(old: Episode, store: FolderStore) -> None:
     for name in ("outcome.json", "sealed.json"):
         os.unlink(episode_folder(old) / name)
