@@ -17,12 +17,13 @@ from evaweb.blinding.visibility import Visibility, visibility_for_request
 from evaweb.collect.selectors import PUBLISHED_RESULTS, accepted_demonstrations
 from evaweb.core.errors import Conflict, NotFound
 from evaweb.episodes import services
-from evaweb.episodes.export_table import CONTENT_TYPE, table_file
+from evaweb.episodes.exports import MCAP, TABLE, ExportFormat, export_file
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
 from evaweb.stations.selectors import station_get
 from evaweb.trials.models import TrialStatus
 from runtime.core.sentences import Pattern
+from runtime.interop.mcap_export import Pictures
 
 _EPISODE_STILL_BEING_RECORDED_PUBLISHED = Pattern(
     "api.episodes.episode_still_being_recorded_published",
@@ -188,7 +189,12 @@ def episode(request: HttpRequest, uuid: UUID) -> Any:
     return EpisodeDetail.of(_found(uuid), visibility_for_request(request))
 
 
-_TABLE = {"schema": {"type": "string", "format": "binary"}}
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+
+
+def _file_of(wanted: ExportFormat, words: str) -> dict[str, Any]:
+    """Return the part of the OpenAPI document that describes an exported file."""
+    return {"responses": {200: {"description": words, "content": {wanted.content_type: _BINARY}}}}
 
 
 @router.get(
@@ -196,14 +202,11 @@ _TABLE = {"schema": {"type": "string", "format": "binary"}}
     response=FAILURES,
     summary="Its three streams as one table",
     url_name="episode-export",
-    openapi_extra={"responses": {200: {"description": "A parquet file", "content": {CONTENT_TYPE: _TABLE}}}},
+    openapi_extra=_file_of(TABLE, "A parquet file"),
 )
 def episode_export(request: HttpRequest, uuid: UUID) -> Any:
     """Return raw, smoothed and executed actions step by step; the file's metadata hold manifest and outcome."""
-    episode = _found(uuid)
-    visibility_for_request(request).require_episode(episode)
-    path = table_file(episode.uuid)
-    return async_to_sync(file_answer)(request, path, CONTENT_TYPE, path.name)
+    return _export_answer(request, uuid, TABLE)
 
 
 @router.post(
@@ -214,10 +217,33 @@ def episode_export(request: HttpRequest, uuid: UUID) -> Any:
 )
 def request_export(request: HttpRequest, uuid: UUID) -> Any:
     """Queue the export of an episode that its station has not exported. The job reports the progress."""
-    require_role(request.auth, Role.OPERATOR)
-    return Status(
-        202, JobOut.of(services.request_export(episode=_found(uuid)), visibility_for_request(request))
-    )
+    return _request_export(request, uuid, TABLE)
+
+
+@router.get(
+    "/{uuid:uuid}/mcap",
+    response=FAILURES,
+    summary="It as one MCAP file",
+    url_name="episode-mcap",
+    openapi_extra=_file_of(MCAP["video"], "An MCAP file"),
+)
+def episode_mcap(request: HttpRequest, uuid: UUID, pictures: Pictures = "video") -> Any:
+    """Return joints, actions, events and pictures as messages of ROS 2, for Foxglove, Rerun and ROS 2.
+
+    `pictures`: `video` for Foxglove, `image-h264` for Rerun, `jpeg` for all programs. The file is kept for a day.
+    """
+    return _export_answer(request, uuid, MCAP[pictures])
+
+
+@router.post(
+    "/{uuid:uuid}/mcap",
+    response={202: JobOut, **FAILURES},
+    summary="Have the MCAP file made",
+    url_name="episode-mcap-asked",
+)
+def request_mcap(request: HttpRequest, uuid: UUID, pictures: Pictures = "video") -> Any:
+    """Queue the export of an episode as MCAP. The job reports the progress."""
+    return _request_export(request, uuid, MCAP[pictures])
 
 
 @router.post(
@@ -250,6 +276,19 @@ def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
 def _accepted(demonstration: Any) -> bool:
     fits = accepted_demonstrations(session=demonstration.session, results=PUBLISHED_RESULTS)
     return fits.filter(pk=demonstration.pk).exists()
+
+
+def _export_answer(request: HttpRequest, uuid: UUID, wanted: ExportFormat) -> Any:
+    episode = _found(uuid)
+    visibility_for_request(request).require_episode(episode)
+    path = export_file(episode.uuid, wanted)
+    return async_to_sync(file_answer)(request, path, wanted.content_type, path.name)
+
+
+def _request_export(request: HttpRequest, uuid: UUID, wanted: ExportFormat) -> Any:
+    require_role(request.auth, Role.OPERATOR)
+    job = services.request_export(episode=_found(uuid), wanted=wanted)
+    return Status(202, JobOut.of(job, visibility_for_request(request)))
 
 
 def _found(uuid: UUID) -> Episode:

@@ -34,6 +34,7 @@ KINDS = {
     "quality": "Checks",
     "publish": "Publication",
     "export": "Table",
+    "mcap": "MCAP file",
     "store": "Videos into the store",
     "archive": "Recording into the store",
     "smoothness": "Smoothness",

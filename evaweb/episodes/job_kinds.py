@@ -16,6 +16,7 @@ from evaweb.episodes import services, verification
 from evaweb.episodes.archive import NotArchived, lock_recording, put_away, remove_unused, use_videos
 from evaweb.episodes.arriving import ingest_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import write_sidecars
+from evaweb.episodes.exports import remove_old_mcap, write_mcap
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
 from evaweb.episodes.manifest import read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
@@ -103,6 +104,31 @@ def export_episode(work: JobContext) -> Mapping[str, Any]:
     """
     path = write_export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
+
+
+@job_kind("mcap")
+def export_episode_as_mcap(work: JobContext) -> Mapping[str, Any]:
+    """Write the episode as one MCAP file, which is kept for a day.
+
+    The job has two arguments: `uuid`, the episode's, and `pictures` (runtime.interop.mcap_export.PICTURES).
+    """
+    uuid = UUID(work.args["uuid"])
+    use_videos(work, uuid)
+    path, summary = write_mcap(uuid, work.args["pictures"], work.report_progress)
+    return {
+        "file": str(path.relative_to(data_dir())),
+        "bytes": summary.bytes,
+        "messages": summary.messages,
+        "coded_again": dict(summary.coded_again),
+        "moved": dict(summary.moved),
+        "left_out": list(summary.left_out),
+    }
+
+
+@periodic_task("MCAP files")
+def remove_mcap_files() -> int:
+    """Remove MCAP files that were made more than a day ago; return their number."""
+    return remove_old_mcap()
 
 
 @job_kind("smoothness")

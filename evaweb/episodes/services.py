@@ -15,7 +15,7 @@ from django.utils import timezone
 
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.episodes.archive import archived_at
-from evaweb.episodes.export_table import exported, job_key
+from evaweb.episodes.exports import TABLE, ExportFormat, exported
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED, RecordedEpisode, read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
@@ -194,9 +194,10 @@ def request_archive(*, uuid: UUID) -> Job:
     return enqueue(kind="archive", key=f"archive:{uuid}", args={"uuid": str(uuid)})
 
 
-def request_export(*, episode: Episode) -> Job:
-    """Queue the export of the three action streams as one table; an existing table is kept."""
-    return enqueue(kind="export", key=job_key(episode.uuid), args={"uuid": str(episode.uuid)})
+def request_export(*, episode: Episode, wanted: ExportFormat = TABLE) -> Job:
+    """Queue the export of an episode to that format; an existing table is kept."""
+    uuid = episode.uuid
+    return enqueue(kind=wanted.job, key=wanted.job_key(uuid), args=wanted.job_args(uuid))
 
 
 def request_smoothness(*, most: int) -> int:

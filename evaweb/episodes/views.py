@@ -23,7 +23,7 @@ from evaweb.core.errors import Conflict, EvaError, NotFound
 from evaweb.episodes import listed, selectors, services
 from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curve_message
-from evaweb.episodes.export_table import CONTENT_TYPE, table_file, table_of
+from evaweb.episodes.exports import FORMATS, export_file, export_format, export_of
 from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_sheet
 from evaweb.episodes.manifest_robot import drawn_robot_for
 from evaweb.episodes.models import Episode
@@ -38,6 +38,8 @@ from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError, read_json
 from runtime.recording.layout import simulated
+
+_SHOWN_EXPORTS = ("table", "mcap-video", "mcap-image-h264")  # JPEG is for programs that know neither
 
 _EPISODE_DOES_NOT_EXIST_THIS = Pattern(
     "episodes.views.episode_does_not_exist_this",
@@ -91,7 +93,7 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
         "episode": episode,
         "trial": selectors.trial_of(episode=episode),
         "stage": stage,
-        "table": table_of(episode=episode),
+        "exports": [export_of(episode=episode, wanted=FORMATS[name]) for name in _SHOWN_EXPORTS],
         "may_review": role_of(request.user) is not Role.VIEWER,
         "tags_known": selectors.tag_counts(sight=visibility_for_request(request)),
         "config": replay_config(episode) | player() if stage.name == "ready" else None,
@@ -113,27 +115,27 @@ def playback_stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
     return answer
 
 
-async def export(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
-    """Return the three action streams as one table; POST queues its creation."""
-    episode = await _known(uuid)
+async def export(request: HttpRequest, uuid: UUID, format: str = "table") -> HttpResponseBase:
+    """Return an exported file of the episode, by default the table of its streams; POST queues its creation."""
+    episode, wanted = await _known(uuid), export_format(format)
     if request.method == "POST":
-        return await sync_to_async(_export_asked)(request, episode)
+        return await sync_to_async(_export_asked)(request, episode, format)
     await sync_to_async(lambda: visibility_for_request(request).require_episode(episode))()
-    path = await sync_to_async(table_file)(uuid)
-    return await file_answer(request, path, CONTENT_TYPE, path.name)
+    path = await sync_to_async(export_file)(uuid, wanted)
+    return await file_answer(request, path, wanted.content_type, path.name)
 
 
-def _export_asked(request: HttpRequest, episode: Episode) -> HttpResponse:
+def _export_asked(request: HttpRequest, episode: Episode, format: str) -> HttpResponse:
     require_role(request.user, Role.OPERATOR)
-    services.request_export(episode=episode)
-    return table(request, episode.uuid)
+    services.request_export(episode=episode, wanted=export_format(format))
+    return export_state(request, episode.uuid, format)
 
 
-def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Show the state of the episode's export table, as a fragment of a page that polls."""
+def export_state(request: HttpRequest, uuid: UUID, format: str) -> HttpResponse:
+    """Show the state of an exported file, as a fragment of a page that polls."""
     episode = episode_get(uuid=uuid)
-    context = {"episode": episode, "table": table_of(episode=episode)}
-    return render(request, "episodes/table.html", context)
+    context = {"episode": episode, "export": export_of(episode=episode, wanted=export_format(format))}
+    return render(request, "episodes/export.html", context)
 
 
 @require_POST

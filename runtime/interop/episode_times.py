@@ -63,7 +63,8 @@ class EpisodeTimes:
         A time that is not known is that of `instead`, if it is known there, else the one before. A time earlier than
         the one before is moved to that.
         """
-        stamps, moved, before = [], 0, -1
+        stamps: list[int] = []
+        moved, before = 0, -1
         others = times if instead is None else instead
         for time, other in zip(times.tolist(), others.tolist(), strict=True):
             stamp = self._stamp(time)

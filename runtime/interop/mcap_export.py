@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from mcap.writer import CompressionType, Writer
+
 from runtime.core.durable_files import creating_durably
-from runtime.core.errors import ConfigurationError, RecordingError
+from runtime.core.errors import RecordingError
 from runtime.interop.episode_topics import EpisodeTopics, Message, Pictures, Topic, episode_topics
 from runtime.interop.ros2_messages import schema_name, schema_text
 from runtime.link.release import version
@@ -18,6 +20,7 @@ from runtime.recording.files import disk_error, to_json
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.scrub import require_intact
 
+_REPORT_EVERY = 1000  # messages
 FORMAT = 1  # of topics and own messages, in the metadata record "eva.export"
 PICTURES: tuple[Pictures, ...] = ("video", "image-h264", "jpeg")
 
@@ -43,14 +46,19 @@ class McapSummary:
         return sum(self.topics.values())
 
 
-def export_mcap(folder: Path, target: Path, pictures: Pictures = "video") -> McapSummary:
+def export_mcap(
+    folder: Path,
+    target: Path,
+    pictures: Pictures = "video",
+    report: Callable[[str], None] = lambda progress: None,
+) -> McapSummary:
     """Write the closed episode in `folder` to the new file `target`, completely or not at all.
 
+    `report` is called with the progress after every thousand messages; an exception from it ends the export.
+
     Raises:
-        ConfigurationError: The package mcap is not installed.
         RecordingError: There is no episode, it is open or damaged, `target` exists, or the disk refuses the file.
     """
-    writing = _library()
     episode = _closed_episode(folder)
     if not target.parent.is_dir():
         raise RecordingError(f"{target.parent} is no folder to write {target.name} to")
@@ -59,7 +67,7 @@ def export_mcap(folder: Path, target: Path, pictures: Pictures = "video") -> Mca
     made = episode_topics(episode, pictures)
     try:
         with creating_durably(target) as file:
-            counts = _write(writing, file, episode, made, pictures)
+            counts = _write(file, episode, made, pictures, report)
             size = file.tell()
     except FileExistsError as error:
         raise _exists(target) from error
@@ -67,16 +75,6 @@ def export_mcap(folder: Path, target: Path, pictures: Pictures = "video") -> Mca
         raise disk_error("writing", target, error) from error
     moved = {topic.name: topic.moved for topic in made.topics if topic.moved}
     return McapSummary(target, counts, size, made.coded_again, moved, made.left_out)
-
-
-def _library() -> Any:
-    try:
-        import mcap.writer
-    except ImportError as error:
-        raise ConfigurationError(
-            "an export as MCAP needs the package mcap, which is not installed: pip install 'eva-web[mcap]'"
-        ) from error
-    return mcap.writer
 
 
 def _closed_episode(folder: Path) -> Episode:
@@ -94,10 +92,14 @@ def _exists(target: Path) -> RecordingError:
 
 
 def _write(
-    writing: Any, file: IO[bytes], episode: Episode, made: EpisodeTopics, pictures: Pictures
+    file: IO[bytes],
+    episode: Episode,
+    made: EpisodeTopics,
+    pictures: Pictures,
+    report: Callable[[str], None],
 ) -> dict[str, int]:
     """Write the whole file; return the number of messages by topic."""
-    writer = writing.Writer(file, compression=writing.CompressionType.ZSTD)
+    writer: Any = Writer(file, compression=CompressionType.ZSTD)
     writer.start(profile="ros2", library=f"evaweb {version()}")
     schemas = {
         kind: writer.register_schema(schema_name(kind), "ros2msg", schema_text(kind).encode())
@@ -105,7 +107,9 @@ def _write(
     }
     channels = [writer.register_channel(topic.name, "cdr", schemas[topic.kind]) for topic in made.topics]
     counts: Counter[str] = Counter({topic.name: 0 for topic in made.topics})
-    for message, place in _merged(made.topics):
+    for number, (message, place) in enumerate(_merged(made.topics)):
+        if number % _REPORT_EVERY == 0:
+            report(f"{number} messages written")
         name = made.topics[place].name
         writer.add_message(
             channels[place], message.stamp, message.payload, publish_time=message.stamp, sequence=counts[name]

@@ -9,10 +9,12 @@ import json
 import re
 import shutil
 import uuid as uuids
+from uuid import UUID
 
 import numpy as np
 from django.utils import timezone
 
+from evaweb.episodes.exports import write_mcap
 from evaweb.episodes.job_kinds import publish_episode
 from evaweb.episodes.models import Episode
 from evaweb.jobs.kinds import JobContext
@@ -201,6 +203,7 @@ class BlindLab:
             )
         resealed(folder)
         write_export(folder, self.data)
+        write_mcap(UUID(folder.name), "video", print)
         self.episode = Episode.objects.create(
             uuid=folder.name,
             station=self.station,

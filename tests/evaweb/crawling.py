@@ -44,6 +44,7 @@ def addresses(lab):
         "version": {"": [1]},
         "camera": {"": ["cam_high"]},
         "code": {"": ["xx"]},
+        "format": {"": ["table", "mcap-video"]},
         "index": {"": [0]},
         "robot": {"": ["agilex_piper"]},
         "digest": {"": [(lab.plan.at_reveal or {}).get("digest", "0" * 64)]},

@@ -10,6 +10,7 @@ import os
 import re
 from itertools import zip_longest
 from typing import Any
+from uuid import UUID
 
 from django.contrib import admin
 from django.core.files.uploadedfile import SimpleUploadedFile
@@ -17,6 +18,7 @@ from django.db import models, transaction
 from django.test import Client
 from django.urls import reverse
 
+from evaweb.episodes.exports import write_mcap
 from evaweb.episodes.models import Episode, Tag
 from evaweb.jobs.models import Job
 from evaweb.plans.models import Slot
@@ -48,6 +50,7 @@ def swap(lab: Any) -> None:
     for folder in lab.data.glob("episodes/*"):  # none before the first run
         resealed(folder)
         write_export(folder, lab.data)
+        write_mcap(UUID(folder.name), "video", print)
     lab.swapped = not lab.swapped
     for name in ("trial", "episode", "command"):
         if getattr(lab, name) is not None:

@@ -22,6 +22,7 @@ _LEFT_OUT = {  # entries of the data folder that are recreated at the next start
     "jobs",
     "lab.lock",
     "logs",
+    "mcap",
     "stops.json",
 }
 # Copied last: a camera file that was moved to the store during the copy is then in the index, which names it there.

@@ -78,11 +78,22 @@ def test_a_table_is_asked_for_made_and_downloaded(rest, viewer, episode):
 
 
 @pytest.mark.django_db
+def test_an_mcap_file_is_asked_for_and_found_by_the_kind_of_its_pictures(rest, viewer, episode):
+    path = f"episodes/{episode.uuid}/mcap"
+    assert "is not made yet" in rest.get(path)[1]["error"]
+    assert viewer.post(path)[0] == 403
+    status, job = rest.post(f"{path}?pictures=jpeg")
+    assert (status, job["kind"], job["key"]) == (202, "mcap", f"mcap:jpeg:{episode.uuid}")
+    assert rest.get(path, pictures="png")[0] == 422
+
+
+@pytest.mark.django_db
+@pytest.mark.parametrize("what", ["export", "mcap"])
 @pytest.mark.parametrize("method", ["get", "post"])
-def test_an_episode_that_is_not_known_has_no_table(rest, tmp_path, method):
+def test_an_episode_that_is_not_known_has_no_file(rest, tmp_path, method, what):
     folder: Path = recorded(tmp_path)
     for name in (folder.name, uuid.uuid4()):
-        status, refused = getattr(rest, method)(f"episodes/{name}/export")
+        status, refused = getattr(rest, method)(f"episodes/{name}/{what}")
         assert (status, refused["error"]) == (404, f"episode {name} does not exist")
     assert not Episode.objects.exists()
 

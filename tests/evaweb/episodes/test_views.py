@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +20,12 @@ from django.urls import reverse
 import robots
 from evaweb.core.binary_frames import decode
 from evaweb.episodes import streaming
+from evaweb.episodes.exports import FORMATS, KEPT_S, remove_old_mcap
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
+from runtime.recording.labels import Label, append_label
 
 pytestmark = pytest.mark.django_db
 
@@ -202,9 +205,7 @@ def test_a_video_that_is_not_there_is_named(closed: Callable[..., Episode], fetc
     assert "cam_high.mp4 of this episode is not on this machine" in body.decode()
 
 
-@pytest.mark.parametrize(
-    "name", ["episode-thumbnail", "episode-curves", "episode-poses", "episode-table", "replay"]
-)
+@pytest.mark.parametrize("name", ["episode-thumbnail", "episode-curves", "episode-poses", "replay"])
 def test_nobody_sees_an_episode_without_logging_in(previewed: Episode, client: Client, name: str) -> None:
     answer = client.get(reverse(name, args=[previewed.uuid]))
     assert answer.status_code == 302
@@ -429,7 +430,7 @@ def test_the_table_is_a_file_to_keep(previewed: Episode, data: Path, fetch: Fetc
 def test_a_table_that_is_not_made_yet_is_made_on_demand(
     previewed: Episode, data: Path, browser: Client, fetch: Fetch, user: User
 ) -> None:
-    path, address = table_file(data), reverse("episode-export", args=[previewed.uuid])
+    path, address = table_file(data), reverse("episode-export", args=[previewed.uuid, "table"])
     content = path.read_bytes()
     path.unlink()
     status, _, body = fetch(address)
@@ -439,10 +440,10 @@ def test_a_table_that_is_not_made_yet_is_made_on_demand(
     assert "Make the table" in page
     asked = browser.post(address).content.decode()
     assert "is being made" in asked
-    assert f'hx-get="{reverse("episode-table", args=[previewed.uuid])}"' in asked
+    assert f'hx-get="{reverse("episode-export-state", args=[previewed.uuid, "table"])}"' in asked
     assert jobs.run_queue("cpu") == 1
     assert fetch(address)[2] == content
-    shown = browser.get(reverse("episode-table", args=[previewed.uuid])).content.decode()
+    shown = browser.get(reverse("episode-export-state", args=[previewed.uuid, "table"])).content.decode()
     assert f'href="{address}"' in shown
     assert "hx-get" not in shown
 
@@ -458,6 +459,52 @@ def test_who_only_looks_downloads_a_table_but_has_none_made(
     assert Job.objects.count() == before
 
 
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "table"])
+def test_an_mcap_file_is_made_on_demand_and_kept_for_a_day(
+    name: str,
+    previewed: Episode,
+    data: Path,
+    browser: Client,
+    fetch: Fetch,
+    settings: Any,
+) -> None:
+    settings.EVA_RESERVE_BYTES = 0
+    address = reverse("episode-export", args=[previewed.uuid, name])
+    assert fetch(address)[0] == 404
+    assert "is being made" in browser.post(address).content.decode()
+    assert jobs.run_queue("cpu") == 1
+    status, headers, body = fetch(address)
+    assert (status, body[:8]) == (200, b"\x89MCAP0\r\n")
+    pictures = name.removeprefix("mcap-")
+    assert headers["Content-Disposition"] == f'attachment; filename="{previewed.uuid}.{pictures}.mcap"'
+    job = Job.objects.get(kind="mcap")
+    assert (job.result["bytes"], job.result["file"]) == (len(body), f"mcap/{previewed.uuid}.{pictures}.mcap")
+    append_label(data, str(previewed.uuid), Label(time.time(), "ann", "success"))
+    assert fetch(address)[0] == 404  # the label is not in it
+    browser.post(address)
+    assert jobs.run_queue("cpu") == 1
+    assert fetch(address)[0] == 200
+    assert remove_old_mcap() == 0
+    assert remove_old_mcap(time.time() + KEPT_S + 1.0) == 1
+    assert fetch(address)[0] == 404
+
+
+def test_an_mcap_file_leaves_the_room_that_recordings_need(
+    previewed: Episode, data: Path, browser: Client, settings: Any
+) -> None:
+    settings.EVA_RESERVE_BYTES = 1 << 60
+    browser.post(reverse("episode-export", args=[previewed.uuid, "mcap-video"]))
+    jobs.run_queue("cpu")
+    job = Job.objects.get(kind="mcap")
+    assert "EVA_RESERVE_GB stays free" in job.error
+    assert list((data / "mcap").iterdir()) == []
+
+
+def test_a_format_that_does_not_exist_is_named(previewed: Episode, fetch: Fetch) -> None:
+    status, _, body = fetch(reverse("episode-export", args=[previewed.uuid, "mcap-h265"]))
+    assert (status, "mcap-image-h264" in body.decode()) == (404, True)
+
+
 def test_a_table_that_cannot_be_made_says_why(previewed: Episode, data: Path, browser: Client) -> None:
     table_file(data).unlink()
     Job.objects.create(kind="export", key=f"export:{previewed.uuid}", status="failed", error="disk full")
@@ -470,7 +517,7 @@ def test_a_table_that_cannot_be_made_says_why(previewed: Episode, data: Path, br
 
 def test_an_episode_that_is_being_written_has_no_table(station: Station, data: Path, browser: Client) -> None:
     episode = Episode.objects.create(station=station)
-    shown = browser.get(reverse("episode-table", args=[episode.uuid])).content.decode()
+    shown = browser.get(reverse("episode-export-state", args=[episode.uuid, "table"])).content.decode()
     assert "href" not in shown
     assert "button" not in shown
 
