@@ -111,8 +111,8 @@ class Mailbox:
             rows = [row for row in covered if row["number"] > self._events_after]
         for start in range(0, len(rows), EVENTS_AT_ONCE):
             some = rows[start : start + EVENTS_AT_ONCE]
-            covered = {"covered": True} if self.redacts_events else {}
-            if not self._send({"type": "events", "boot": history.boot, "events": some, **covered}):
+            mark = {"covered": True} if self.redacts_events else {}
+            if not self._send({"type": "events", "boot": history.boot, "events": some, **mark}):
                 return
             self._events_after = some[-1]["number"]
         last = covered[-1]["number"] if covered else self._covered_up_to[1]

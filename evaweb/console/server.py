@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from daphne.server import Server, twisted_loop  # must come first: it selects the reactor
 
 # isort: split
+from autobahn.exception import Disconnected
 from twisted.internet import reactor, task
 
 from evaweb.console.connection_limits import ConnectionLimiter, LimitedFactory, Request
@@ -99,8 +100,12 @@ class _Server(Server):
         self._entrance, self._arrivals = entrance, arrivals
 
     async def handle_reply(self, protocol: Any, message: Any) -> None:
-        """Send a part of an answer; return when its next part may be produced."""
-        await super().handle_reply(protocol, message)
+        """Send a part of an answer; return when its next part may be produced.
+
+        What is sent to a page that has just left is dropped: the consumer is told so by a message of its own.
+        """
+        with suppress(Disconnected):
+            await super().handle_reply(protocol, message)
         if message["type"] == "http.response.body" and message.get("more_body"):
             await until_read(protocol)
 

@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 
 from evaweb.console.feed import feeds
-from evaweb.core.errors import Conflict, NotFound
+from evaweb.core.errors import Conflict, NotFound, StationGone
 from evaweb.plans import image_store
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.stations.models import Station
@@ -47,5 +47,5 @@ def _fetch(station: Station, cameras: list[str]) -> bytes:
     """Return a current JPEG of the first of the `cameras`; b"" if an image did not come in time."""
     try:
         return image_store.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
-    except Conflict:
+    except (Conflict, StationGone):  # the second: the link was lost since it was looked at
         return b""

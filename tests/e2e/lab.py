@@ -115,7 +115,20 @@ class Demo:
             self.child.send_signal(number)
         code = self.child.wait(PATIENCE_S)
         self.output.close()
+        assert unhandled(self.data) == []
         return code
+
+
+def unhandled(data):
+    """The first exception in the log of each process of a lab that serves people, with what stands around it."""
+    found = []
+    for name in ("web", "stops", "gate"):
+        path = data / "logs" / f"{name}.log"
+        before, mark, after = (path.read_text(errors="replace") if path.exists() else "").partition(
+            "Traceback (most recent call last)"
+        )
+        found += [before[-300:] + mark + after[:3000]] if mark else []
+    return found
 
 
 def left(processes):

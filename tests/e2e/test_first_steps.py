@@ -11,7 +11,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.conftest import SETS
-from tests.e2e.lab import ROOT, WIDE, environment
+from tests.e2e.lab import ROOT, WIDE, environment, unhandled
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -44,7 +44,9 @@ class EmptyLab:
 
     def end(self):
         self.child.send_signal(signal.SIGINT)
-        return self.child.wait(PATIENCE_S)
+        code = self.child.wait(PATIENCE_S)
+        assert unhandled(self.data) == []
+        return code
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests import migrated
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.lab import CHROMIUM, ROOT, WIDE, environment
+from tests.e2e.lab import CHROMIUM, ROOT, WIDE, environment, unhandled
 from tests.namespaces import Network
 from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 
@@ -225,6 +225,7 @@ class Walk:
         finally:
             self.network.close()
         assert set(ended.values()) <= {0}, ended
+        assert unhandled(self.data("lab")) == []
 
 
 def documented_inline(begins, place, given):

@@ -131,6 +131,21 @@ def test_a_restart_begins_the_events_anew():
     assert page.texts[-1]["boot"] == "c"
 
 
+def test_redacted_events_come_once_each_with_the_parts_that_wait_beside_them():
+    page = Page("joints")
+    page.box.redacts_events = True
+    page.box.want_events(0, "b")
+    rows = []
+    for number in range(1, 4):
+        hidden = {"number": 2 * number - 1, "time": float(number), "kind": "policy_failed", "text": "secret"}
+        rows += [hidden, hidden | {"number": 2 * number, "kind": "state", "text": "ready -> running"}]
+        page.history = History().extended("b", rows)
+        page.put("joints", b"%d" % number)
+        page.box.credit()
+    assert page.frames == [b"1", b"2", b"3"]
+    assert page.events == [1_000_000, 2_000_000, 3_000_000]
+
+
 def test_a_page_that_is_not_heard_gets_a_bounded_number_of_texts_and_then_the_rest():
     page = Page()
     page.box.want_events(0, "b")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import resource
@@ -19,13 +20,28 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from autobahn.exception import Disconnected
 
-from evaweb.console.server import _address
+from evaweb.console.server import _address, _Server
 from evaweb.serving.listeners import PortInUseError, open_listener
 from tests import migrated
 from tests.processes import PATIENCE_S, eventually
 
 MANAGE = Path(__file__).parents[3] / "manage.py"
+
+
+class _Left:
+    """What daphne has for the connection of a page that has left."""
+
+    def handle_reply(self, message):
+        raise Disconnected("Attempt to send on a closed protocol")
+
+
+def test_what_is_sent_to_a_page_that_has_left_is_no_error():
+    server = object.__new__(_Server)
+    leaving = _Left()
+    server.connections = {leaving: {}}
+    asyncio.run(server.handle_reply(leaving, {"type": "websocket.send", "text": "late"}))
 
 
 @contextmanager
