@@ -118,8 +118,8 @@ def demo_plan(
     scene: Scene,
     checkpoints: Sequence[Checkpoint],
     repetitions: int,
-    design: str = StoppingRule.EVIDENCE,
-    order: str = Allocation.PAIRED,
+    design: str = StoppingRule.EVIDENCE,  # type: ignore[assignment]
+    order: str = Allocation.PAIRED,  # type: ignore[assignment]
 ) -> Plan:
     """Return a frozen blind plan that compares two checkpoints at all positions of a scene.
 

@@ -75,7 +75,7 @@ class TrialRecord(Line):
     evaluation: Annotated[Name, Column("evaluation__name", always_visible=True, table=False)]
     evaluation_kind: Annotated[
         Evaluation.Kind, Column("evaluation__kind", always_visible=True, api="never", table=False)
-    ] = Evaluation.Kind.OPEN_BENCH
+    ] = Evaluation.Kind.OPEN_BENCH  # type: ignore[assignment]
     version: Annotated[_Count, Column("evaluation_version", always_visible=True, table=False)]
     station: Annotated[str, Field(pattern=STATION_NAME), Column("station__name", always_visible=True)]
     simulated: Annotated[
@@ -234,7 +234,7 @@ class ScoreLine(Line):
     failure: Annotated[str, Field(max_length=60)] = ""
     failure_phase: Annotated[str, Field(max_length=60)] = ""
     reason: str = ""
-    source: Score.Source = Score.Source.HUMAN
+    source: Score.Source = Score.Source.HUMAN  # type: ignore[assignment]
     milestones: Annotated[tuple[OutcomeLine, ...], RowPath("outcomes__all")] = ()
 
     @field_validator("milestones")

@@ -339,7 +339,7 @@ def score_trial(
     note: str = "",
     failure: str = "",
     failure_phase: str = "",
-    source: str = Score.Source.HUMAN,
+    source: str = Score.Source.HUMAN,  # type: ignore[assignment]
     reason: str = "",
     uuid: UUID | str | None = None,
 ) -> Score:

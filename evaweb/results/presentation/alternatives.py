@@ -160,7 +160,8 @@ def _of_these(
     if original.counts is None:
         single, both = alone(original, pair, blocks)
         return (of_so_many(single, len(both)) if both else single), both
-    counts, total = [], (0, 0)
+    total: tuple[int, ...] = (0, 0)
+    counts = []
     for at in left:
         before = original.counts[at - 1] if at else (0, 0)
         total = tuple(

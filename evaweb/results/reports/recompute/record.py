@@ -162,8 +162,8 @@ def changes(
             sentences.append(
                 "integrity.json is not that of which the reveal kept the digest: " + ", ".join(STAYS)
             )
-    stated = ". ".join(reveal.get("headline", ()))
-    if any(row.get("headline", stated) != stated for row in rows):
+    headline = ". ".join(reveal.get("headline", ()))
+    if any(row.get("headline", headline) != headline for row in rows):
         sentences.append("trials.csv has another headline than the reveal")
     return sentences
 

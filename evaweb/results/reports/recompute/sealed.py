@@ -127,7 +127,9 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     version = plan.get(
         "format", 1
     )  # reveals record a digest from format 3 on, blocks and arms from 4 on, texts from 6 on
-    kinds = () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
+    kinds: tuple[str, ...] = (
+        () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
+    )
     kinds += ("headline", "caveats", "record") if version >= 6 else ()
     kinds += ("setting", "measured", "judged", "conduct") if version >= _ALL_KEPT else ()
     required = kinds if arms_of(plan) or version >= _ALL_KEPT else ()
@@ -156,7 +158,7 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     code_list = codes(key, max((int(row["order"]) for row in rows), default=0))
     for row in rows:
         unit = units[int(row["slot"])]
-        fields = [int(row["slot"]), int(row["block"]), row["checkpoint"], row["scene"], int(row["position"])]
-        if unit[:5] != fields or row["code"] != code_list[int(row["order"]) - 1]:
+        own = [int(row["slot"]), int(row["block"]), row["checkpoint"], row["scene"], int(row["position"])]
+        if unit[:5] != own or row["code"] != code_list[int(row["order"]) - 1]:
             sentences.append(f"trial {row['trial']} ({row['code']}) is not what the schedule foresaw: {unit}")
     return sentences
