@@ -66,14 +66,14 @@ def request_archives() -> list[Job]:
     rows = here.filter(previewed_at__isnull=False, verified_at__isnull=False, started_at__lt=limit)
     rows = rows.exclude(kind=IMPORTED).exclude(seal="")
     uuids = rows.order_by("started_at").values_list("uuid", flat=True)
-    asked = _asked(now)
+    recent = _recently_moved(now)
     # Those that stay must not hide the ones behind them.
-    waiting = islice((uuid for uuid in uuids if f"archive:{uuid}" not in asked), MOST_EPISODES)
+    waiting = islice((uuid for uuid in uuids.iterator() if f"archive:{uuid}" not in recent), MOST_EPISODES)
     old = (uuid for uuid in waiting if _closed_before(uuid, limit))
     return [request_archive(uuid=uuid) for uuid in list(islice(old, _ARCHIVED_AT_ONCE))]
 
 
-def _asked(now: datetime) -> set[str]:
+def _recently_moved(now: datetime) -> set[str]:
     """Return the keys of jobs that have not archived their recording, and need not be asked for again yet."""
     left = Q(status=JobStatus.DONE, result__archived=False) | Q(cancelled_by__isnull=False)
     failed = Q(status=JobStatus.FAILED, finished_at__gt=now - LATE_AFTER)
