@@ -13,6 +13,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -28,6 +29,7 @@ from runtime.core.sentences import Pattern, fixed
 LONGEST_S = 300  # longest validity of a signed URL
 _STEP = 1 << 20  # size of a part [bytes]
 _IN_USE_S = 600.0  # time after its last use during which a cached file is not removed
+_DRAFT_S = 24 * 3600.0  # time since its last part after which a file that is not complete is abandoned
 _CONNECT, _ANSWER = "3s", "30s"
 _RETRIES: Any = {"max_retries": 3, "retry_timeout": timedelta(seconds=20)}
 _NO_STORE = fixed(
@@ -293,8 +295,15 @@ def _parts(path: Path) -> Iterator[bytes]:
 
 
 def _draft(folder: Path, parts: Iterable[bytes]) -> tuple[Path, str]:
-    """Write `parts` to a new file in `folder`, flushed to disk; return its path and SHA-256."""
+    """Write `parts` to a new file in `folder`, flushed to disk; return its path and SHA-256.
+
+    Files that a killed process left there more than _DRAFT_S ago are removed.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    for abandoned in folder.glob(".draft*"):
+        with suppress(FileNotFoundError):  # another process has removed it, or given it its name
+            if time.time() - abandoned.stat().st_mtime > _DRAFT_S:
+                abandoned.unlink()
     digest = hashlib.sha256()
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".draft", delete=False) as draft:
         try:

@@ -77,6 +77,16 @@ def test_the_cache_brings_what_is_wanted_once_and_compares_it(store, video, tmp_
         assert not list((tmp_path / "cache").glob(".draft*"))
 
 
+def test_what_a_killed_process_left_in_a_store_goes_after_a_day(video, tmp_path):
+    (drafts := tmp_path / "store" / ".drafts").mkdir(parents=True)
+    ages = {".draft-old": 25.0, ".draft-under-way": 23.0}
+    for name, hours in ages.items():
+        (drafts / name).touch()
+        os.utime(drafts / name, (time.time() - 3600.0 * hours,) * 2)
+    FolderStore(tmp_path / "store").put(video, "video/mp4")
+    assert [path.name for path in drafts.iterdir()] == [".draft-under-way"]
+
+
 @pytest.mark.exhaustive
 def test_a_bucket_whose_object_was_changed_is_not_believed(server, video, tmp_path):
     store = S3Store(server.bucket(prefix="changed"))
