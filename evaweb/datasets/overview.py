@@ -33,21 +33,8 @@ DEPTH = 3  # levels below the data folder that are searched for datasets
 # Folders of the lab itself, which contain no datasets.
 _OWN = frozenset(
     (
-        *(
-            "episodes",
-            "previews",
-            "arrivals",
-            "cache",
-            "uploads",
-            "reveals",
-            "exports",
-            "labels",
-            "quality",
-            "quarantine",
-            "reviews",
-            "scores",
-            "sessions",
-        ),
+        *("episodes", "previews", "arrivals", "archived", "cache", "uploads", "reveals", "exports", "labels"),
+        *("mcap", "quality", "quarantine", "reviews", "scores", "sessions"),
         *("stations", "jobs", "broker", "unwritten", "pictures", "logs", "static", "media"),
         *("deployments", "diagnosis", "link"),
     )
