@@ -19,9 +19,9 @@ from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, 
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.simulation.bench.bench import BenchState, camera_arm
+from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.bench.conveyor import CONVEYOR, Conveyor
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest
 from runtime.simulation.environments import Environment
 from runtime.simulation.node import parser
 from runtime.simulation.render import Renderer

@@ -76,6 +76,8 @@ class GripperTable(Table):
     """URDF joints that move with it: their values [rad or m] at `lower` and at `upper`; for drawing only."""
     apart: Pair | None = None
     """Distance of the fingers [m] at `close` and at `open`. Default: the number itself if `unit` is "m"."""
+    force: Positive | None = None
+    """Force with which each finger presses [N]; for the bench with contact forces only."""
     tip: TipTable | None = None
     """Frame of the fingertips. Default: derived from the fingers of the URDF, the sliding children of `eef_link`."""
 

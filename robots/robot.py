@@ -27,7 +27,8 @@ class Gripper:
     The number moves from `lower` to `upper`, and the gripper is open at `open` and closed at `close`. `fingers` maps
     URDF joints to their two values [rad or m], the first for `lower` and the second for `upper`. `apart` has the
     distance between the fingers [m] at `close` and at `open`; it is None if unknown. A binary gripper switches at
-    `threshold`, with a `hysteresis` as a share of its travel; for other grippers both are None.
+    `threshold`, with a `hysteresis` as a share of its travel; for other grippers both are None. `force` is the force
+    with which each finger presses [N]; None if unknown.
     """
 
     index: int
@@ -41,6 +42,7 @@ class Gripper:
     hysteresis: float | None
     fingers: Mapping[str, tuple[float, float]]
     apart: tuple[float, float] | None
+    force: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

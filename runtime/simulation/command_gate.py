@@ -18,7 +18,7 @@ from runtime.core.clock import ClockMap
 from runtime.core.errors import CodecError
 from runtime.core.types import Float64
 from runtime.simulation import drives
-from runtime.simulation.bench.tabletop import ResetRequest
+from runtime.simulation.bench.block_table import ResetRequest
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -1,4 +1,4 @@
-"""Environments of a simulated node: test patterns, a bench with blocks and a plate, or a bench with a belt."""
+"""Environments of a simulated node: test patterns, or a bench with blocks and a plate, a belt, or contact forces."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import numpy as np
 
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64, UInt8
+from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.conveyor import Conveyor
 from runtime.simulation.bench.numbered_frames import Scene
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.tabletop import Tabletop
 
 if TYPE_CHECKING:
     from robots import Robot
 
-NAMES = ("none", "tabletop", "conveyor")
+NAMES = ("none", "tabletop", "conveyor", "contact")
 
 
 class Environment(ABC):
@@ -74,7 +75,7 @@ class TestPatternEnvironment(Environment):
 class BenchEnvironment(Environment):
     """Environment with a simulated bench, and the renderer of its cameras."""
 
-    def __init__(self, robot: Robot, options: argparse.Namespace, tabletop: Tabletop) -> None:
+    def __init__(self, robot: Robot, options: argparse.Namespace, tabletop: BlockTable) -> None:
         import cv2  # no other environment needs it
 
         from runtime.simulation.render import Renderer
@@ -114,7 +115,7 @@ def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
     """Return the environment that `options.bench` names.
 
     Raises:
-        SetupError: If --blocks is not 1 with a conveyor.
+        SetupError: If --blocks is not 1 with a conveyor, or the contact physics is not installed.
         BenchError: If the blocks do not fit on the tabletop.
     """
     if options.bench == "conveyor":
@@ -125,4 +126,8 @@ def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
         return BenchEnvironment(robot, options, Conveyor(robot, options.seed))
     if options.bench == "tabletop":
         return BenchEnvironment(robot, options, Tabletop(robot, options.seed, options.blocks))
+    if options.bench == "contact":
+        from runtime.simulation.contact.bench import ContactTabletop  # no other environment needs its modules
+
+        return BenchEnvironment(robot, options, ContactTabletop(robot, options.seed, options.blocks))
     return TestPatternEnvironment(robot, options)

@@ -3,8 +3,9 @@
 Each tick executes the newest command, moves the plant and publishes one observation. Beyond the plain protocol an
 observation contains the frame number (`seq`), colour order (`encoding`), current master (`master`), number of the
 master's last message that took effect (`ack`), refused messages by reason (`refused`), whether the robot is `holding`
-because it receives no commands, and the state of its `drives`. With `--bench tabletop` or `conveyor` there are objects;
-the word "scene_reset" resets them, and the field `truth` is their ground truth.
+because it receives no commands, and the state of its `drives`. With `--bench tabletop`, `contact` (the
+same with contact forces) or `conveyor` there are objects; the word "scene_reset" resets them, and the field `truth` is
+their ground truth.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from runtime.core.errors import RuntimeFault, SetupError
 from runtime.core.types import Float64, UInt8
 from runtime.simulation import environments, program
 from runtime.simulation.bench.bench import BenchError
+from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.bench.plant import Plant, poses
-from runtime.simulation.bench.tabletop import ResetRequest
 from runtime.simulation.command_gate import AcceptedCommand, CommandGate
 from runtime.simulation.drives import Drives
 from runtime.simulation.scripts.gestures import Gesture

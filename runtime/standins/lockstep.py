@@ -93,7 +93,7 @@ def station(
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
     spec = check_deployment(loader.load(path, assignments))
-    arguments = ("--robot", spec.robot.name, "--bench", "tabletop", *bench_options)
+    arguments = ("--robot", spec.robot.name, "--bench", "tabletop", *bench_options)  # the last --bench counts
     options = node_parser().parse_args(arguments)
     around = environments.make_environment(spec.robot, options)
     peers = in_process_peers(spec, clock, around, options)
@@ -109,6 +109,12 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument("deployment", type=Path, help="one whose transport is zmq and simulated")
     line.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
     line.add_argument("--seed", type=int, default=0, help="the first layout of the bench")
+    line.add_argument(
+        "--bench",
+        choices=("tabletop", "contact"),
+        default="tabletop",
+        help="how blocks move: by rules, or by contact forces (default: tabletop)",
+    )
     line.add_argument(
         "--serve",
         action="append",
@@ -141,9 +147,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 server = stack.enter_context(closing(serve.build_server(server_options, clock)))
                 urls[str(server_options.name or len(urls))] = str(server.start()["url"])
             own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
-            bench = ("--seed", options.seed, "--width", options.width, "--height", options.height)
+            bench = ("--bench", options.bench, "--seed", options.seed)
+            size = ("--width", options.width, "--height", options.height)
             served = station(
-                options.deployment, [*own, *options.assignments], clock, *map(str, bench), paced=options.paced
+                options.deployment,
+                [*own, *options.assignments],
+                clock,
+                *map(str, bench + size),
+                paced=options.paced,
             )
             stack.enter_context(closing(served))
             program.announce_ready({"policies": urls}, options.ready_file)

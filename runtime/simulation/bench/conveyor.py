@@ -24,7 +24,8 @@ from runtime.simulation.bench.bench import (
     BenchError,
     BenchLayout,
 )
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.block_table import ResetRequest
+from runtime.simulation.bench.tabletop import Tabletop
 
 if TYPE_CHECKING:
     from robots import Robot

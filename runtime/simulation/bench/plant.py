@@ -16,13 +16,18 @@ LAG = 0.06  # [s] time constant of each joint
 
 
 class Plant:
-    """Joints `q` float64 [D] of a robot; they start at home, or at `start`, and move towards `target` [D]."""
+    """Joints `q` float64 [D] of a robot; they start at home, or at `start`, and move towards `target` [D].
+
+    On a bench with contact forces, `reference` [D] is the position at which the drives aim; forces keep `q` slightly
+    away from it. It is None if the joints are exactly where the drives aim.
+    """
 
     def __init__(self, robot: Robot, lag: float = LAG, start: Float64 | None = None) -> None:
         self._robot = robot
         self._lag = lag
         self.q: Float64 = (robot.poses["home"] if start is None else start).copy()
         self.target: Float64 = self.q.copy()
+        self.reference: Float64 | None = None
 
     def advance(self, seconds: float) -> None:
         """Advance by `seconds`: the joints approach the target with a first-order lag, within their velocity limits."""
@@ -31,8 +36,8 @@ class Plant:
         self.q = self.q + np.clip(wish, -reach, reach)
 
     def hold(self) -> None:
-        """Set the target to the present joints, so that the robot stops."""
-        self.target = self.q.copy()
+        """Set the target to the present joints, so that the robot stops; jaws keep the force with which they grip."""
+        self.target = (self.q if self.reference is None else self.reference).copy()
 
 
 def poses(robot: Robot, q: Float64) -> dict[str, Float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -9,14 +10,16 @@ import cv2
 import numpy as np
 
 import robots
+from robots import Robot
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, UInt8
 from runtime.motion.timeline import DimensionKinds, Timeline
 from runtime.policies.pictures import resize_image, to_layout
 from runtime.safety.filter import Limits, RobotState, SafetyFilter, SafetySettings
 from runtime.simulation.bench.bench import Bench
+from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.tabletop import Tabletop
 from runtime.simulation.render import Renderer
 from runtime.simulation.scripts.pick_place import PickPlace, Skill
 from runtime.simulation.scripts.script import Answer
@@ -52,13 +55,19 @@ class Outcome:
 class Trial:
     """One policy server and one bench; every `run` is another connection, unless it goes on with the last."""
 
-    def __init__(self, skill: Skill, delay: int = 6, pose: str = "ready") -> None:
+    def __init__(
+        self,
+        skill: Skill,
+        delay: int = 6,
+        pose: str = "ready",
+        make: Callable[[Robot, int], BlockTable] = Tabletop,
+    ) -> None:
         self.clock = VirtualClock()
         self.policy = PickPlace(ROBOT, 50, RATE, skill, clock=self.clock)
         self.delay = delay
         self.pose = pose
         self.plant = Plant(ROBOT)
-        self.table = Tabletop(ROBOT, 0)
+        self.table = make(ROBOT, 0)
         self.answer: Answer = self.policy.begin()
         self.dark = False
         self._number = 0

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 import robots
-from robots import Group
+from robots import Group, Robot
 from robots.rotations import quaternion_of_matrix
 from runtime.core.types import Float64
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.simulation.bench.arm_frames import arm_frames
 from runtime.simulation.bench.bench import tip_in_world
+from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.tabletop import Tabletop
 
 ROBOT = robots.load_robot("agilex_piper")
 KINEMATICS = CompiledKinematics(ROBOT)
@@ -29,12 +31,18 @@ POSITIONS = {"block": [-0.15, 0.2, 20.0], "plate": [-0.2, 0.36]}
 class SimulatedOperator:
     """A tabletop with its robot; `yaw` is that of the jaws [rad], `tilt` [rad] outwards from straight down."""
 
-    def __init__(self, seed: int = 1, arm: Group = LEFT, blocks: int = 1) -> None:
+    def __init__(
+        self,
+        seed: int = 1,
+        arm: Group = LEFT,
+        blocks: int = 1,
+        make: Callable[[Robot, int, int], BlockTable] = Tabletop,
+    ) -> None:
         assert arm.gripper_dim is not None
         side = 1.0 if arm is LEFT else -1.0
         self.arm = arm
         self.gripper = arm.gripper_dim
-        self.table = Tabletop(ROBOT, 0, blocks)
+        self.table = make(ROBOT, 0, blocks)
         positions = {name: [side * place[0], *place[1:]] for name, place in POSITIONS.items()}
         self.table.reset(ResetRequest(f"reset {seed}", seed, positions))
         self.plant = Plant(ROBOT, start=READY)

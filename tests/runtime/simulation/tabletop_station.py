@@ -22,8 +22,9 @@ from runtime.core.types import Float64, UInt8
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.simulation.bench.bench import Bench, camera_arm
+from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.tabletop import Tabletop
 from runtime.simulation.environments import Environment
 from runtime.simulation.node import parser
 from runtime.simulation.render import Renderer
@@ -54,7 +55,7 @@ def renderer(robot: str) -> Renderer:
 class SlowEye(Environment):
     """A tabletop whose overhead camera is slow."""
 
-    def __init__(self, robot: Robot, table: Tabletop) -> None:
+    def __init__(self, robot: Robot, table: BlockTable) -> None:
         self.table = table
         self._robot = robot
         self._dark = {camera.key: np.zeros((8, 8, 3), np.uint8) for camera in robot.cameras}
@@ -113,11 +114,16 @@ def planned(name: str, data: Path, url: str | None, assignments: Sequence[str] =
 
 @contextmanager
 def served(
-    name: str, seed: int, data: Path, assignments: Sequence[str] = (), serve: Serve = openpi_server
-) -> Iterator[tuple[Tabletop, Lockstep]]:
+    name: str,
+    seed: int,
+    data: Path,
+    assignments: Sequence[str] = (),
+    serve: Serve = openpi_server,
+    make: Callable[[Robot, int], BlockTable] = Tabletop,
+) -> Iterator[tuple[BlockTable, Lockstep]]:
     """A bench laid out by `seed`, and a station at it, not yet connected; its policy is served on its clock."""
     made, clock = planned(name, data, None, assignments), VirtualClock()
-    bench = SlowEye(made.robot, Tabletop(made.robot, seed))
+    bench = SlowEye(made.robot, make(made.robot, seed))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop"])
     policy: Any = made.deployment.policy  # of a kind that has these keys
     in_poses = policy.action_space == "eef"
@@ -133,10 +139,15 @@ def served(
 
 
 def pick_and_place(
-    name: str, seed: int, data: Path, assignments: Sequence[str] = (), serve: Serve = openpi_server
+    name: str,
+    seed: int,
+    data: Path,
+    assignments: Sequence[str] = (),
+    serve: Serve = openpi_server,
+    make: Callable[[Robot, int], BlockTable] = Tabletop,
 ) -> Trial:
     """Set up, run until the block lies on the plate or for so long."""
-    with served(name, seed, data, assignments, serve) as (table, station):
+    with served(name, seed, data, assignments, serve, make) as (table, station):
         session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")

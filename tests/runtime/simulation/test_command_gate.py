@@ -7,7 +7,7 @@ import pytest
 
 import robots
 from runtime.core import msgpack_arrays
-from runtime.simulation.bench.tabletop import ResetRequest
+from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.command_gate import CommandGate
 from runtime.simulation.drives import DriveSwitch
 

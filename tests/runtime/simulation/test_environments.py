@@ -7,9 +7,10 @@ import pytest
 
 import robots
 from runtime.simulation import node
+from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.bench.conveyor import Conveyor
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.tabletop import Tabletop
 from runtime.simulation.environments import BenchEnvironment
 from runtime.simulation.render import Renderer
 

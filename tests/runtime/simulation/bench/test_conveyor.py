@@ -10,6 +10,7 @@ import pytest
 import robots
 from runtime.simulation.bench.belt_motion import draw_belt_motion
 from runtime.simulation.bench.bench import BenchError
+from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.bench.conveyor import (
     CONVEYOR,
     COURSE_S,
@@ -19,7 +20,6 @@ from runtime.simulation.bench.conveyor import (
     TrackingErrors,
 )
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.bench.tabletop import ResetRequest
 from runtime.simulation.scripts.chase import PlaceMap
 
 ROBOT = robots.load_robot("agilex_piper")

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.simulation.bench.bench import BenchError
-from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
+from runtime.simulation.bench.block_table import ResetRequest
+from runtime.simulation.bench.tabletop import Tabletop
 from tests.examples import some
 from tests.runtime.simulation.simulated_operator import (
     LEFT,

@@ -1,0 +1,159 @@
+"""Simulated tabletop with contact physics: friction alone holds a block between the jaws.
+
+Drives move the arms: each joint's reference follows its target as on the bench without contact forces, and a position
+controller with limited effort moves the joint along its reference. Forces can stop joints; a reference is then at most
+a little ahead of its joint. The plant's joints are the measured ones, so that a held block stops the jaws.
+
+The simulation is deterministic: the same commands at the same times after the same reset have the same result, on
+machines of one kind.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from runtime.core.types import Float64
+from runtime.simulation.bench.bench import Bench
+from runtime.simulation.bench.block_table import BlockTable, ResetRequest
+from runtime.simulation.bench.plant import Plant
+from runtime.simulation.contact.geoms import import_mujoco
+from runtime.simulation.contact.model import build_model
+from runtime.simulation.contact.physics import PLANT_STEP, STEP, Physics
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_SUBSTEPS = round(PLANT_STEP / STEP)
+_LONGEST_NOTE = 1 / 30  # [s] longest time between two updates of milestones
+
+
+class ContactTabletop(BlockTable):
+    """Blocks and a plate in front of a robot, all moved by forces.
+
+    Whoever sets the plant's joints, as a reset of the robot does, moves the robot there at once.
+
+    Raises:
+        SetupError: If MuJoCo is not installed.
+    """
+
+    step = PLANT_STEP
+
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int,
+        blocks: int = 1,
+        bench: Bench | None = None,
+        physics: Physics | None = None,
+    ) -> None:
+        self._mujoco = import_mujoco()
+        self._built = build_model(robot, bench or Bench(), blocks, physics or Physics())
+        self._joints = self._built.joints
+        self._model = self._built.model
+        self._data = self._mujoco.MjData(self._model)
+        self._measured = np.full(robot.dim, np.nan)  # joints that the plant had after the last step
+        self._reference = self._measured
+        self._speed = np.zeros(len(self._joints.offsets))  # of the references, 0 of stopped joints
+        self._stopped = np.zeros(len(self._joints.offsets), bool)
+        super().__init__(seed, blocks, bench)
+
+    def advance(self, plant: Plant, seconds: float) -> None:
+        """Advance the plant and the bench by `seconds`; what the robot touches may stop its joints."""
+        if not np.array_equal(plant.q, self._measured):
+            self._move_robot(plant.q)
+        parts = math.ceil(seconds / _LONGEST_NOTE - 1e-9)
+        for _ in range(parts):
+            steps = math.ceil(seconds / parts / self.step - 1e-9)
+            for _ in range(steps):
+                self._step(plant, seconds / parts / steps)
+            self._observe(seconds / parts)
+        plant.q = self._measured = self._read_joints()
+        plant.reference = self._reference.copy()
+
+    def _place_objects(self, wish: ResetRequest) -> None:
+        super()._place_objects(wish)
+        joints, data = self._joints, self._data
+        robot = data.qpos[joints.positions].copy()
+        self._mujoco.mj_resetData(self._model, data)
+        data.qpos[joints.positions] = robot
+        data.mocap_pos[self._built.plate] = *self._plate, 0.0
+        for block, start in zip(self._blocks, self._built.blocks, strict=True):
+            data.qpos[start : start + 3] = block.pose[:3, 3]
+            self._mujoco.mju_mat2Quat(data.qpos[start + 3 : start + 7], block.pose[:3, :3].ravel())
+        self._stop_drives()
+
+    def _move_robot(self, q: Float64) -> None:
+        """Place the robot's joints at q [D] at once, without a motion."""
+        self._reference = q.copy()
+        self._data.qpos[self._joints.positions] = self._joints.coupling @ q + self._joints.offsets
+        self._data.qvel[self._joints.velocities] = 0.0
+        self._stop_drives()
+
+    def _stop_drives(self) -> None:
+        self._speed[:] = 0.0
+        self._stopped[:] = False
+
+    def _step(self, plant: Plant, seconds: float) -> None:
+        """Advance the references by `seconds`, and the robot's joints and the blocks with them."""
+        joints, data = self._joints, self._data
+        start = joints.coupling @ self._reference + joints.offsets
+        plant.q = self._reference
+        plant.advance(seconds)
+        end = joints.coupling @ plant.q + joints.offsets
+        self._drive(start, (end - start) / seconds, seconds)
+        values = data.qpos[joints.positions]
+        held = np.clip(end, values - joints.errors, values + joints.errors)
+        self._stopped = held != end
+        self._reference = plant.q
+        if self._stopped.any():
+            self._reference = plant.q + joints.readout @ (held - end)
+
+    def _drive(self, start: Float64, speed: Float64, seconds: float) -> None:
+        """Advance the physics while the references move from `start` [n] at `speed` [n].
+
+        An arm that follows its reference is given each change of the reference's speed: a drive with a model of its arm
+        applies the torque for it. The position controllers then have to balance contact forces only, and their limits
+        apply to these. The torques of a stopped joint are those of its controller.
+        """
+        joints, data = self._joints, self._data
+        speed = np.where(self._stopped & joints.arms, 0.0, speed)
+        data.qvel[joints.velocities] += np.where(joints.arms, speed - self._speed, 0.0)
+        self._speed = speed
+        step = seconds / _SUBSTEPS
+        self._model.opt.timestep = step
+        for index in range(_SUBSTEPS):
+            data.ctrl[joints.actuators] = start + (index * step + joints.lead_times) * speed
+            self._mujoco.mj_step(self._model, data)
+
+    def _read_joints(self) -> Float64:
+        """Return the measured joints [D]; numbers that move no link are at their references."""
+        joints, q = self._joints, self._reference.copy()
+        values = self._data.qpos[joints.positions]
+        q[joints.dims] = (joints.readout @ (values - joints.offsets))[joints.dims]
+        return q
+
+    def _observe(self, seconds: float) -> None:
+        """Update the blocks' poses, what holds them, and the milestones, `seconds` after the last time."""
+        holders = self._holders()
+        for index, (block, start) in enumerate(zip(self._blocks, self._built.blocks, strict=True)):
+            turned = np.empty(9)
+            self._mujoco.mju_quat2Mat(turned, self._data.qpos[start + 3 : start + 7])
+            block.pose[:3, :3] = turned.reshape(3, 3)
+            block.pose[:3, 3] = self._data.qpos[start : start + 3]
+            block.held_by = holders.get(index, "")
+            block.update_rest(seconds)
+        self._note()
+
+    def _holders(self) -> dict[int, str]:
+        """Return the arms that hold blocks, by number of the block: both fingers are in contact with it."""
+        contacts = self._data.contact
+        touched: dict[tuple[int, str], set[int]] = {}
+        for pair in contacts.geom[contacts.dist <= 0].tolist():
+            for finger, other in (pair, pair[::-1]):
+                if finger in self._built.finger_geoms and other in self._built.block_geoms:
+                    arm, side = self._built.finger_geoms[finger]
+                    touched.setdefault((self._built.block_geoms[other], arm), set()).add(side)
+        return {block: arm for (block, arm), sides in touched.items() if len(sides) == 2}

@@ -1,0 +1,87 @@
+"""MuJoCo model of a bench: a robot's arms, a table, a plate and blocks.
+
+Nothing but contact forces acts between a block and a gripper. The two fingers of a gripper are coupled, as by its rack
+and pinion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from runtime.simulation.bench.bench import Bench
+from runtime.simulation.contact import physics as numbers
+from runtime.simulation.contact.arms import ArmBuilder, DrivenJoints
+from runtime.simulation.contact.geoms import Geoms, import_mujoco
+from runtime.simulation.contact.physics import Physics
+from runtime.simulation.contact.solids import Solid
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactModel:
+    """Compiled model, with the places of its parts in MuJoCo's arrays.
+
+    `blocks` are the indices of the first of the seven position numbers of each block. `block_geoms` maps shapes to the
+    numbers of blocks, `finger_geoms` to an arm and a side. `plate` is the number of the plate among the movable fixed
+    bodies.
+    """
+
+    model: Any
+    joints: DrivenJoints
+    blocks: tuple[int, ...]
+    block_geoms: dict[int, int]
+    finger_geoms: dict[int, tuple[str, int]]
+    plate: int
+
+
+def build_model(robot: Robot, bench: Bench, blocks: int, physics: Physics) -> ContactModel:
+    """Return the model of a robot at a bench with so many blocks.
+
+    Raises:
+        SetupError: If MuJoCo is not installed.
+    """
+    mujoco = import_mujoco()
+    spec = _new_spec(mujoco)
+    _add_objects(spec, Geoms(mujoco), bench, blocks, physics)
+    arms = ArmBuilder(robot, physics, mujoco, spec)
+    arms.add()
+    model = spec.compile()
+    names = [f"block {index}" for index in range(blocks)]
+    return ContactModel(
+        model,
+        arms.driven_joints(model),
+        tuple(int(model.joint(name).qposadr[0]) for name in names),
+        {int(model.geom(name).id): index for index, name in enumerate(names)},
+        {int(model.geom(name).id): finger for name, finger in arms.fingers.items()},
+        int(model.body("plate").mocapid[0]),
+    )
+
+
+def _new_spec(mujoco: Any) -> Any:
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.compiler.boundmass, spec.compiler.boundinertia = numbers.LEAST_MASS, numbers.LEAST_INERTIA
+    spec.option.timestep = numbers.STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = numbers.IMPRATIO
+    return spec
+
+
+def _add_objects(spec: Any, geoms: Geoms, bench: Bench, blocks: int, physics: Physics) -> None:
+    world = spec.worldbody
+    geoms.add_plane(world, physics.table_friction)
+    middle = np.eye(4)
+    middle[2, 3] = bench.plate_height / 2
+    disc = Solid("cylinder", (bench.plate_radius, bench.plate_height), middle)
+    geoms.add_solid(world.add_body(name="plate", mocap=True), disc, physics.plate_friction)
+    for index in range(blocks):
+        body = world.add_body(name=f"block {index}")
+        body.add_freejoint(name=f"block {index}")
+        geom = geoms.add_block(body, bench.block_edge, physics.block_friction)
+        geom.name, geom.mass = f"block {index}", physics.block_mass
