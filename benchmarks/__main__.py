@@ -11,6 +11,7 @@ from robots.broken_pipe import exit_on_broken_pipe
 
 _BENCHMARKS = (
     "chaos",
+    "contact",
     "coverage",
     "designs",
     "estop",

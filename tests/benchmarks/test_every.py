@@ -17,6 +17,7 @@ OPTIONS = {
     "pages": {"plans": 2, "trials": 40},
 }
 FEWER = {
+    "contact": {"contact.SEEDS": 1, "contact.DEPLOYMENTS": {"ur5e": "tabletop_ur5e"}},
     "glass": {"glass._MARGIN_S": 0.2},
     "lab": {"climb.RUNGS": [1, 2], "climb._MOST_VIEWERS": 10, "lab._CUTS": 2, "lab._UPLOAD_MB": 50},
     "loop": {"loop.RATES": [30.0]},
@@ -54,7 +55,7 @@ if __name__ == "__main__":  # and not in a process that it starts
 
 
 # What is no lab is made beside other tests; those that another test makes whole are not made twice.
-COMPUTED = ("ik", "moving_target", "partial_credit", "strategies")
+COMPUTED = ("contact", "ik", "moving_target", "partial_credit", "strategies")
 ELSEWHERE = (
     "coverage",
     "designs",
