@@ -148,33 +148,41 @@ class ArmBuilder:
         return parent.add_body(name=name, pos=pose[:3, 3], quat=quaternion, gravcomp=1.0)
 
     def _add_joint(self, body: Any, joint: _Joint, axis: Float64, slides: bool, inertia: float) -> None:
-        """Add a joint to a body, with its drive."""
-        mujoco, drive = self._mujoco, joint.drive
+        """Add a joint to a body, with an actuator whose gains are set once the model has inertias."""
+        mujoco = self._mujoco
         kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
         body.add_joint(name=joint.name, type=kind, axis=axis, armature=inertia)
         actuator = self._spec.add_actuator(
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
-        actuator.gainprm[0] = drive.stiffness
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        actuator.biasprm[1:3] = -drive.stiffness, -drive.damping
-        actuator.forcelimited, actuator.forcerange = True, (-drive.effort, drive.effort)
+        actuator.forcelimited, actuator.forcerange = True, (-joint.drive.effort, joint.drive.effort)
         self._joints.append(joint)
 
-    def driven_joints(self, model: Any) -> DrivenJoints:
-        """Return the joints that the drives move, in the compiled model."""
+    def set_drives(self, model: Any) -> DrivenJoints:
+        """Set the gains of all drives in the compiled model, and return the joints that they move."""
         joints = self._joints
         coupling = np.array([joint.row for joint in joints])
         placed = [model.joint(joint.name) for joint in joints]
+        velocities = np.array([joint.dofadr[0] for joint in placed], np.intp)
+        actuators = np.array([model.actuator(joint.name).id for joint in joints], np.intp)
+        drives = [
+            joint.drive if joint.finger else joint.drive.sized_for(float(inertia))
+            for joint, inertia in zip(joints, model.dof_M0[velocities], strict=True)
+        ]
+        for actuator, drive in zip(actuators, drives, strict=True):
+            model.actuator_gainprm[actuator, 0] = drive.stiffness
+            model.actuator_biasprm[actuator, 1:3] = -drive.stiffness, -drive.damping
+            model.actuator_forcerange[actuator] = -drive.effort, drive.effort
         return DrivenJoints(
             coupling=coupling,
             offsets=np.array([joint.offset for joint in joints]),
             readout=np.linalg.pinv(coupling),
             dims=np.flatnonzero(coupling.any(axis=0)),
             positions=np.array([joint.qposadr[0] for joint in placed], np.intp),
-            velocities=np.array([joint.dofadr[0] for joint in placed], np.intp),
-            actuators=np.array([model.actuator(joint.name).id for joint in joints], np.intp),
-            errors=np.array([joint.drive.error for joint in joints]),
-            lead_times=np.array([joint.drive.damping_time for joint in joints]),
+            velocities=velocities,
+            actuators=actuators,
+            errors=np.array([drive.error for drive in drives]),
+            lead_times=np.array([drive.damping_time for drive in drives]),
             arms=np.array([not joint.finger for joint in joints]),
         )

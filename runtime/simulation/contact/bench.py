@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 _SUBSTEPS = round(PLANT_STEP / STEP)
 _LONGEST_NOTE = 1 / 30  # [s] longest time between two updates of milestones
+# Solvers leave motions of nanometres. Changes below these bounds are not shown, so that images need not be drawn again.
+_SHOWN_M = 5e-7  # [m, or part of a unit axis]
+_SHOWN_RAD = 1e-7  # [rad, or unit of a gripper]
 
 
 class ContactTabletop(BlockTable):
@@ -70,7 +73,9 @@ class ContactTabletop(BlockTable):
             for _ in range(steps):
                 self._step(plant, seconds / parts / steps)
             self._observe(seconds / parts)
-        plant.q = self._measured = self._read_joints()
+        q = self._read_joints()
+        self._measured = np.where(np.abs(q - self._measured) > _SHOWN_RAD, q, self._measured)
+        plant.q = self._measured.copy()
         plant.reference = self._reference.copy()
 
     def _place_objects(self, wish: ResetRequest) -> None:
@@ -87,7 +92,7 @@ class ContactTabletop(BlockTable):
 
     def _move_robot(self, q: Float64) -> None:
         """Place the robot's joints at q [D] at once, without a motion."""
-        self._reference = q.copy()
+        self._reference = self._measured = q.copy()
         self._data.qpos[self._joints.positions] = self._joints.coupling @ q + self._joints.offsets
         self._data.qvel[self._joints.velocities] = 0.0
         self._stop_drives()
@@ -139,13 +144,19 @@ class ContactTabletop(BlockTable):
         """Update the blocks' poses, what holds them, and the milestones, `seconds` after the last time."""
         holders = self._holders()
         for index, (block, start) in enumerate(zip(self._blocks, self._built.blocks, strict=True)):
-            turned = np.empty(9)
-            self._mujoco.mju_quat2Mat(turned, self._data.qpos[start + 3 : start + 7])
-            block.pose[:3, :3] = turned.reshape(3, 3)
-            block.pose[:3, 3] = self._data.qpos[start : start + 3]
+            pose = self._pose(self._data.qpos[start : start + 7])
+            if np.abs(pose - block.pose).max() > _SHOWN_M:
+                block.pose = pose
             block.held_by = holders.get(index, "")
             block.update_rest(seconds)
         self._note()
+
+    def _pose(self, placed: Float64) -> Float64:
+        """Return the pose [4, 4] of a body with position and quaternion `placed` [7]."""
+        turned, pose = np.empty(9), np.eye(4)
+        self._mujoco.mju_quat2Mat(turned, placed[3:])
+        pose[:3, :3], pose[:3, 3] = turned.reshape(3, 3), placed[:3]
+        return pose
 
     def _holders(self) -> dict[int, str]:
         """Return the arms that hold blocks, by number of the block: both fingers are in contact with it."""

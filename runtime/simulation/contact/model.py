@@ -54,7 +54,7 @@ def build_model(robot: Robot, bench: Bench, blocks: int, physics: Physics) -> Co
     names = [f"block {index}" for index in range(blocks)]
     return ContactModel(
         model,
-        arms.driven_joints(model),
+        arms.set_drives(model),
         tuple(int(model.joint(name).qposadr[0]) for name in names),
         {int(model.geom(name).id): index for index, name in enumerate(names)},
         {int(model.geom(name).id): finger for name, finger in arms.fingers.items()},

@@ -6,6 +6,7 @@ the robots' descriptions; a gripper without one has the placeholder of this modu
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 STEP = 1 / 240  # [s] longest step of the solver
@@ -52,7 +53,7 @@ FINGER_SIZE = (0.02, 0.02, 0.08)  # [m] of fingers that the description does not
 class Drive:
     """Position controller of a joint: its greatest effort [N m or N], and the error [rad or m] that causes it.
 
-    Arms of this class hold their joints within hundredths of a degree under their payload. What is soft here is the
+    The drives of arms hold their joints within hundredths of a degree under their payload. What matters is their
     greatest effort: an arm that presses a block onto the table stops instead of pushing the block through it.
     """
 
@@ -71,7 +72,17 @@ class Drive:
         """Velocity gain [N m s/rad or N s/m]."""
         return self.stiffness * self.damping_time
 
+    def sized_for(self, inertia: float) -> Drive:
+        """Return the drive for a joint that moves `inertia` [kg m2 or kg].
 
+        A joint that carries much, as that of a torso, has a stronger drive, and damping without overshoot.
+        """
+        stiffness = max(self.stiffness, inertia * LEAST_FREQUENCY**2)
+        critical = 2 * math.sqrt(inertia / stiffness)
+        return Drive(stiffness * self.error, self.error, max(self.damping_time, critical))
+
+
+LEAST_FREQUENCY = 2 * math.pi * 5.0  # [rad/s] natural frequency of a joint and its drive; placeholder
 REVOLUTE = Drive(effort=40.0, error=0.01, damping_time=0.02)  # placeholder
 PRISMATIC = Drive(effort=400.0, error=0.002, damping_time=0.02)  # placeholder
 

@@ -601,6 +601,7 @@ def test_it_ends_when_its_lifeline_ends(start: Any) -> None:
         (["--robot", "agilex_piper", *FREE, "--rate", "0"], "0 is not above zero"),
         (["--robot", "agilex_piper", *FREE, "--start-pose", "x"], "has no pose 'x'; it has home, ready"),
         (["--robot", "agilex_piper", *FREE, "--bench", "tabletop", "--blocks", "0"], "0 blocks by seed 0"),
+        (["--robot", "agilex_piper", *FREE, "--bench", "contact", "--blocks", "0"], "0 blocks by seed 0"),
         (["--robot", "agilex_piper", *FREE, "--groups", "left_arm,tail"], "tail"),
     ],
 )

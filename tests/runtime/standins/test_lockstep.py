@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import robots
 from runtime.config import loader
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
@@ -23,6 +24,8 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.recording.reader import open_episode
 from runtime.simulation.bench.tabletop import Tabletop
+from runtime.simulation.contact.bench import ContactTabletop
+from runtime.simulation.environments import BenchEnvironment, make_environment
 from runtime.simulation.node import parser
 from runtime.standins import lockstep, serve
 from runtime.standins.lockstep import SuccessDetector, in_process_peers
@@ -110,7 +113,11 @@ class Operator:
 
 
 def courses(
-    data: Path, trials: Sequence[tuple[int, int, float]], dawdles: int = 0, slow_s: float = 0.0
+    data: Path,
+    trials: Sequence[tuple[int, int, float]],
+    dawdles: int = 0,
+    slow_s: float = 0.0,
+    make: type[Tabletop | ContactTabletop] = Tabletop,
 ) -> list[Course]:
     """Trials of (policy, seed, seconds), at a bench whose policies may take longer than they say."""
     clock = VirtualClock()
@@ -129,7 +136,7 @@ def courses(
     urls = [str(server.start()["url"]) for server in servers]
     given = [f'data_dir="{data}"', f'policy.url="{urls[0]}"', "recording.export=false", "lease.ttl_s=600"]
     made = check_deployment(loader.load(DEPLOYMENTS / "tabletop.toml", given))
-    around = SlowEye(made.robot, Tabletop(made.robot, 1))
+    around = SlowEye(made.robot, make(made.robot, 1))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop", "--seed", "1"])
     over, peers = SuccessDetector(around.truth, clock), in_process_peers(made, clock, around, options)
     with closing(ServedLockstep(made, clock, over, peers=peers)) as station:
@@ -143,10 +150,13 @@ def courses(
 
 
 @pytest.mark.exhaustive
-def test_the_same_plan_gives_the_same_course_however_busy_the_machine(tmp_path: Path) -> None:
+@pytest.mark.parametrize("make", [Tabletop, ContactTabletop])
+def test_the_same_plan_gives_the_same_course_however_busy_the_machine(
+    make: type[Tabletop | ContactTabletop], tmp_path: Path
+) -> None:
     trials = [(1, 4, 3.0), (0, 5, 3.0)]
-    *first, skilled = courses(tmp_path / "first", [*trials, (0, 4, 20.0)])
-    second = courses(tmp_path / "second", trials, dawdles=7, slow_s=0.01)
+    *first, skilled = courses(tmp_path / "first", [*trials, (0, 4, 20.0)], make=make)
+    second = courses(tmp_path / "second", trials, dawdles=7, slow_s=0.01, make=make)
 
     for one, other in zip(first, second, strict=True):
         assert np.array_equal(one.sent, other.sent)
@@ -185,6 +195,18 @@ def test_a_station_without_a_declared_bench_is_refused(tmp_path: Path) -> None:
         SetupError, match=r"transport.kind = 'zmq' with a bench in lockstep; allowed: zmq with"
     ):
         lockstep.station(DEPLOYMENTS / "tabletop.toml", given, VirtualClock())
+
+
+def test_the_bench_is_the_one_that_is_asked_for() -> None:
+    arguments = [str(DEPLOYMENTS / "tabletop.toml")]
+    assert lockstep.parser().parse_args(arguments).bench == "tabletop"
+    assert lockstep.parser().parse_args([*arguments, "--bench", "contact"]).bench == "contact"
+    options = parser().parse_args(
+        ["--robot", "ur5e", "--bench", "contact", "--width", "64", "--height", "48"]
+    )
+    around = make_environment(robots.load_robot("ur5e"), options)
+    assert isinstance(around, BenchEnvironment)
+    assert isinstance(around._tabletop, ContactTabletop)
 
 
 def test_only_a_server_that_can_declare_its_times_is_served() -> None:

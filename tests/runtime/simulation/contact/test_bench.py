@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import robots
 from runtime.simulation.bench.bench import BenchError, tip_in_world
 from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.bench.plant import Plant
@@ -148,19 +149,23 @@ def test_a_robot_that_stops_keeps_its_grip():
     assert hands.block[2] > 0.06
 
 
-def test_arms_that_touch_nothing_move_as_on_the_bench_without_forces():
-    plants = []
+@pytest.mark.some(2)
+@pytest.mark.parametrize("name", robots.robot_names())
+def test_arms_that_touch_nothing_move_and_come_to_rest_as_on_the_bench_without_forces(name):
+    robot = robots.load_robot(name)
+    arms = np.delete(np.arange(robot.dim), robot.gripper_dims)
+    courses = []
     for make in (Tabletop, ContactTabletop):
-        table, plant = make(ROBOT, 0), Plant(ROBOT)
-        plant.target = READY
+        table, plant = make(robot, 0), Plant(robot)
+        plant.target = robot.poses["ready"]
         course = []
-        for _ in range(20):
+        for _ in range(90):
             table.advance(plant, 1 / RATE)
             course.append(plant.q)
-        plants.append(np.array(course))
-    arms = np.delete(np.arange(ROBOT.dim), ROBOT.gripper_dims)
-    np.testing.assert_allclose(plants[1][:, arms], plants[0][:, arms], atol=2e-3)
-    np.testing.assert_allclose(plants[1][-1], READY, atol=5e-3)
+        courses.append(np.array(course))
+    np.testing.assert_allclose(courses[1][:, arms], courses[0][:, arms], atol=5e-3)
+    np.testing.assert_allclose(courses[1][-1], robot.poses["ready"], atol=1e-3)
+    np.testing.assert_array_equal(courses[1][-1], courses[1][-10])
 
 
 def test_the_same_seed_and_commands_give_the_same_bits_whatever_was_before():
@@ -196,6 +201,11 @@ def test_blocks_that_nothing_touches_stay_where_they_are():
     for _ in range(3 * RATE):
         table.advance(plant, 1 / RATE)
     np.testing.assert_allclose(table.truth()["blocks"], before, atol=1e-4)
+    shown = [block.pose for block in table.state().blocks]
+    table.advance(plant, 1 / RATE)
+    np.testing.assert_array_equal(
+        [block.pose for block in table.state().blocks], shown
+    )  # no image is drawn again
 
 
 def test_the_scripted_policy_puts_the_block_on_the_plate():
