@@ -36,7 +36,7 @@ _SHOWN_RAD = 1e-7  # [rad, or unit of a gripper]
 class ContactTabletop(BlockTable):
     """Blocks and a plate in front of a robot, all moved by forces.
 
-    Whoever sets the plant's joints, as a reset of the robot does, moves the robot there at once.
+    If the plant's joints are set from outside between two steps, the robot is placed there at once.
 
     Raises:
         SetupError: If MuJoCo is not installed.
@@ -124,8 +124,9 @@ class ContactTabletop(BlockTable):
         apply to these. The torques of a stopped joint are those of its controller.
         """
         joints, data = self._joints, self._data
-        speed = np.where(self._stopped & joints.arms, 0.0, speed)
-        data.qvel[joints.velocities] += np.where(joints.arms, speed - self._speed, 0.0)
+        following = joints.arms & ~self._stopped
+        speed = np.where(joints.arms & self._stopped, 0.0, speed)
+        data.qvel[joints.velocities] += np.where(following, speed - self._speed, 0.0)
         self._speed = speed
         step = seconds / _SUBSTEPS
         self._model.opt.timestep = step
