@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots import urdf
+from robots.inertials import Inertial
 from robots.rotations import quaternion_of_matrix
 from runtime.core.types import Float64
 from runtime.simulation.bench.hands import Opening
@@ -85,6 +86,7 @@ class ArmBuilder:
             solids = self._solids.hand_solids if part in hands.values() else self._solids.link_solids
             for solid in solids(part):
                 self._geoms.add_solid(added[part], solid, self._physics.finger_friction)
+            self._set_inertial(added[part], self._solids.inertial(part))
         for arm in self._robot.arms:
             if arm.gripper is not None:
                 self._add_jaws(arm, hands[arm.name], added[hands[arm.name]])
@@ -108,6 +110,15 @@ class ArmBuilder:
         driven = _Joint(name, tables.coupling[part], float(tables.offsets[part]), drive)
         self._add_joint(link, driven, joint.axis, slides, inertia)
         return link
+
+    def _set_inertial(self, link: Any, inertial: Inertial | None) -> None:
+        """Set mass and inertia of a link; without an inertial they follow from its shapes and a placeholder."""
+        if inertial is None:
+            return
+        tensor = inertial.inertia
+        link.explicitinertial = True
+        link.mass, link.ipos = inertial.mass, inertial.centre
+        link.fullinertia = [*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]]
 
     def _add_jaws(self, arm: Group, hand: int, link: Any) -> None:
         assert arm.gripper is not None

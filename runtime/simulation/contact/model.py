@@ -66,6 +66,9 @@ def _new_spec(mujoco: Any) -> Any:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.compiler.boundmass, spec.compiler.boundinertia = numbers.LEAST_MASS, numbers.LEAST_INERTIA
+    spec.compiler.balanceinertia = (
+        True  # published inertias are often rounded so that they are not quite physical
+    )
     spec.option.timestep = numbers.STEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -1,7 +1,8 @@
 """Numbers of the contact physics: masses, friction, drives and solver, each with its source.
 
 Placeholders are all in this module, and each is marked as such: no measurement supports it. Forces of grippers are in
-the robots' descriptions; a gripper without one has the placeholder of this module.
+the robots' descriptions, masses and inertias of links in their URDFs; if one is missing there, the placeholder of this
+module takes its place.
 """
 
 from __future__ import annotations

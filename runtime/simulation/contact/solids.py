@@ -1,4 +1,4 @@
-"""Collision shapes of a robot for contact physics, each in the frame of the part that carries it.
+"""Collision shapes and inertias of a robot for contact physics, in the frames of the parts that carry them.
 
 Links have the capsules of the collision check. Hands have the shapes that are drawn, because a capsule around a palm
 would reach between the fingers. All fingers are jaws that slide: see `jaw_solids`.
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from robots import Body, shapes
 from robots.capsules import capsules
+from robots.inertials import Inertial, combine, read_inertials
 from robots.shapes import Shape
 from runtime.core.types import Float64
 from runtime.simulation.bench.arm_frames import arm_frames
@@ -38,7 +39,7 @@ class Solid:
 
 
 class RobotSolids:
-    """Collision shapes of a robot.
+    """Collision shapes and inertias of a robot.
 
     `carrier` [P] is the index of the part with which each part of the robot's `body` is rigidly connected and which is
     nearest to the root; `moving` [P, D] tells which numbers of the robot's vector move a part.
@@ -51,6 +52,7 @@ class RobotSolids:
         self._robot = robot
         self._drawn = _by_link(robot)
         self._capsules = capsules(robot)
+        self._inertials = read_inertials(robot.urdf)
         self._home: Float64 = self.body.poses(robot.poses["home"])
 
     def rigid_parts(self, part: int) -> list[int]:
@@ -80,11 +82,23 @@ class RobotSolids:
             for shape in self._drawn.get(self._link(part), ())
         ]
 
+    def inertial(self, carrier: int) -> Inertial | None:
+        """Return the inertial of all parts that are rigidly connected with `carrier`, in its frame.
+
+        None if the URDF declares none of them.
+        """
+        declared = [
+            (self.relative(part, carrier), self._inertials[self._link(part)])
+            for part in self.rigid_parts(carrier)
+            if self._link(part) in self._inertials
+        ]
+        return combine(declared) if declared else None
+
     def jaw_solids(self, arm: Group) -> dict[int, list[Solid]]:
         """Return the shapes of the closed jaws in the frame of the fingertips, by side: -1 and 1, the sign of y.
 
         Jaws slide along y from there. This is exact for parallel grippers. The links of other grippers swing, and
-        their pads come forward by some millimetres as they close; here the whole finger slides, as far apart as the
+        their pads come forward by up to 2 cm as they close; here the whole finger slides, as far apart as the
         description declares. Shapes of closed fingers that reach past the middle (racks, crossed links) are deep in
         the palm and are left out.
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 
 import mujoco
@@ -77,6 +78,22 @@ def test_the_robots_numbers_are_read_back_from_the_joints(robot):
     q = np.random.default_rng(2).uniform(robot.lower, robot.upper)
     read = joints.readout @ (joints.coupling @ q)
     np.testing.assert_allclose(read[joints.dims], q[joints.dims], atol=1e-9)
+
+
+def test_a_link_has_the_inertia_that_its_urdf_declares(tmp_path):
+    folder = tmp_path / "ur5e"
+    shutil.copytree(robots.load_robot("ur5e").folder, folder)
+    described = folder / "ur5e.urdf"
+    tensor = '<inertia ixx="0.2" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.1"/>'
+    inertial = f'<inertial><origin xyz="0 0 0.1"/><mass value="7.5"/>{tensor}</inertial>'
+    link = '<link name="forearm_link">'
+    text = described.read_text()
+    assert link in text
+    described.write_text(text.replace(link, link + inertial))
+    body = build_model(robots.load_robot(str(folder)), Bench(), 1, Physics()).model.body("arm/forearm_link")
+    assert body.mass == pytest.approx(7.5)
+    np.testing.assert_allclose(body.ipos, [0, 0, 0.1], atol=1e-9)
+    np.testing.assert_allclose(np.sort(body.inertia), [0.1, 0.2, 0.2], atol=1e-9)
 
 
 def test_without_mujoco_a_sentence_says_what_to_install(monkeypatch):
