@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 STEP = 1 / 240  # [s] longest step of the solver
-PLANT_STEP = 1 / 120  # [s] longest step of the drives' reference, as on the bench without contact forces
+PLANT_STEP = 1 / 60  # [s] longest step of the references, which move at constant speed during a step
 
 # Contacts, see "Solver parameters" of MuJoCo's documentation. A time constant is at least two steps of the solver. The
 # impedance of 0.99 lets a block of 45 g that a gripper squeezes with 70 N yield by less than a millimetre.
