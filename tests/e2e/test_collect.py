@@ -199,7 +199,9 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(col
         ann.can_start()
         press(0)
         with suppress(AssertionError):
-            eventually(lambda: ann.collect["episode"], "an episode is open", 3 * PATIENCE_S)
+            eventually(
+                lambda: ann.collect["episode"], "an episode is open"
+            )  # a third of the patience around it
         return ann.collect["episode"]
 
     begun = eventually(begin, "an episode is open", 3 * PATIENCE_S)

@@ -149,7 +149,7 @@ def test_the_playback_says_whose_step_it_is_and_gives_the_streams_away(trial, op
     assert f"chunk {found[1]} " in told.inner_text()
     assert {"chunk", "overlap"} <= set(page.locator("#legend-marks .strong").all_text_contents())
     page.locator(".replay-details summary").click()
-    table = page.locator("#table a")
+    table = page.locator("#export-table a")
     table.wait_for()
     answer = page.request.get(f"{operator.demo.url}{table.get_attribute('href')}")
     assert answer.body()[:4] == answer.body()[-4:] == b"PAR1"
