@@ -16,14 +16,25 @@ from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec
 from evaweb.trials.models import Checkpoint
 
 SKILLED, CLUMSY = "pick-place-40k", "pick-place-8k"
+
+
+@dataclass(frozen=True)
+class ScriptedPolicy:
+    """Scripted policy of a simulated bench: its latency, and the options of its server that determine its skill."""
+
+    description: str
+    latency_ms: int
+    skill: tuple[str, ...]
+
+
 POLICIES = {
-    SKILLED: (
-        "Scripted; sees the block within a millimetre or two, answers in 80 ms.",
-        ("--noise", "1", "--latency-ms", "80"),
+    SKILLED: ScriptedPolicy(
+        "Scripted; sees the block within a millimetre or two, answers in 80 ms.", 80, ("--noise", "1")
     ),
-    CLUMSY: (
+    CLUMSY: ScriptedPolicy(
         "Scripted; misjudges the block by centimetres, often lets go early or grasps short, answers in 250 ms.",
-        ("--noise", "14", "--failure-rate", "0.4", "--latency-ms", "250"),
+        250,
+        ("--noise", "14", "--failure-rate", "0.4"),
     ),
 }
 
@@ -48,8 +59,12 @@ class Benches:
         return programs.bench(self.seed, *self.pictures)
 
     def skill(self, policy: str) -> tuple[str, ...]:
-        """Return the command-line options of a policy's server, which determine its skill."""
-        return (*POLICIES[policy][1], "--seed", str(self.seed))
+        """Return the command-line options of a policy's server that determine its skill."""
+        return (*POLICIES[policy].skill, "--seed", str(self.seed))
+
+    def server(self, policy: str) -> tuple[str, ...]:
+        """Return the command-line options of a policy's server in real time: its skill and its latency."""
+        return (*self.skill(policy), "--latency-ms", str(POLICIES[policy].latency_ms))
 
 
 def simulated_options(parser: ArgumentParser) -> None:
@@ -88,12 +103,14 @@ def bring(
     """
     program = programs.tabletop(robot, how.options, f"bench-{station}")
     node = yield from _starting(processes, program, "the simulated bench")
-    for policy, (description, _) in POLICIES.items():
+    for policy, scripted in POLICIES.items():
         name = f"{policy}-{robot}"
-        serving = programs.policy(name, robot, how.skill(policy), known_port(name))
+        serving = programs.policy(name, robot, how.server(policy), known_port(name))
         if serving.name not in processes.pids():
             addresses = yield from _starting(processes, serving, f"the policy {name}")
-            demo_rows.demo_checkpoint(name=name, description=description, policy={"url": addresses["url"]})
+            demo_rows.demo_checkpoint(
+                name=name, description=scripted.description, policy={"url": addresses["url"]}
+            )
     url = _url_of(f"{SKILLED}-{robot}")
     return [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',

@@ -33,6 +33,7 @@ from runtime.policies.groot import arrays
 from runtime.policies.groot.modality import parse_modalities
 from runtime.policies.groot.req_socket import ReqLink
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
+from runtime.policies.response_delay import ResponseDelaySettings
 from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.policies.websocket_link import error_headline
 
@@ -54,7 +55,7 @@ _HINTS = (  # errors of servers of one dialect on requests in another
 )
 
 
-class Config(RequestSettings):
+class Config(ResponseDelaySettings, RequestSettings):
     """A policy server of Isaac GR00T."""
 
     kind: Literal["gr00t"] = "gr00t"

@@ -33,6 +33,7 @@ from runtime.policies.async_inference.grpc_channel import Channel
 from runtime.policies.async_inference.pickles import MODULES, TimedAction, load_actions
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
 from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.response_delay import ResponseDelaySettings
 from runtime.policies.tunnel.settings import TunnelSettings
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ EXCLUSIVE = True  # the server has one checkpoint and one observation, those of 
 _PAUSES = (0.05, 0.5)  # shortest and longest pause after an empty response [s]
 
 
-class Config(RequestSettings):
+class Config(ResponseDelaySettings, RequestSettings):
     """LeRobot's policy server, which loads the checkpoint that the station names."""
 
     kind: Literal["lerobot"] = "lerobot"

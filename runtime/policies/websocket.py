@@ -15,9 +15,9 @@ from runtime.core.environment import read_secret
 from runtime.core.errors import CodecError, PolicyError, WrongProtocolError
 from runtime.core.host_references import Variable
 from runtime.core.sentences import Pattern, fixed
-from runtime.core.settings import Settings
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.health import require_healthy
+from runtime.policies.response_delay import ResponseDelaySettings
 from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.policies.websocket_link import ANSWER_LIMIT, WebsocketLink
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 _REPEATED = fixed("policy.server.repeated", "the answer is byte for byte the one before, to another request")
 
 
-class ServerSettings(Settings):
+class ServerSettings(ResponseDelaySettings):
     """Address and deadlines of a policy server on a websocket."""
 
     url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"

@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 class Behaviour:
     """Behaviour of the server: rows per chunk, their rate [Hz], duration of an inference [s], fault.
 
-    `rtc` is the format in which requests contain committed rows; "prev_action" accepts plain requests, too. With
-    `declared` the server answers at once and states `latency` in its answer, for clients that account for it in
-    lockstep.
+    `rtc` is the format in which requests contain committed rows; "prev_action" accepts plain requests, too.
     """
 
     horizon: int = 50
@@ -40,7 +38,6 @@ class Behaviour:
     fault: Fault = NONE
     seed: int = 0
     rtc: Name = "prev_action"
-    declared: bool = False
 
 
 class OpenpiServer(WebsocketServer):
@@ -100,8 +97,7 @@ class OpenpiServer(WebsocketServer):
         if request.prefix is not None:
             actions = continue_prefix(actions, request.prefix, self._robot.binary_dims)
         took = 1e3 * self._took(started)
-        timing = {} if self._behaviour.declared else {"infer_ms": took}  # a declared duration is not measured
-        timing |= {} if previous_ms is None else {"prev_total_ms": previous_ms}
+        timing = {"infer_ms": took} | ({} if previous_ms is None else {"prev_total_ms": previous_ms})
         own = {"origin_actions": self._space.encode(actions)} if self._behaviour.rtc != "none" else {}
         return {
             "actions": apply_fault(self._behaviour.fault, actions),
@@ -113,11 +109,8 @@ class OpenpiServer(WebsocketServer):
     def _took(self, started: float) -> float:
         """Return the duration [s] of an answer that was begun at `started` [s].
 
-        If the server only declares its latency, the configured latency is returned at once. Otherwise this waits until
-        the latency has passed since `started`, and returns the measured duration.
+        This waits until the configured latency has passed since `started`.
         """
-        if self._behaviour.declared:
-            return self._behaviour.latency
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))
         return time.monotonic() - started
 

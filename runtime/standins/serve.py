@@ -100,7 +100,6 @@ def parser() -> argparse.ArgumentParser:
     groot.add_argument("--token-env", metavar="NAME", help="environment variable with the API token it wants")
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     program.add_arguments(line)
-    line.set_defaults(declared=False)  # set by `made`
     return line
 
 
@@ -124,8 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def build_server(options: argparse.Namespace, clock: Clock | None = None) -> StandInServer:
     """Return the server that a command line describes, not yet started.
 
-    With a virtual `clock` the server answers at once and states how long the answer would take; only openpi with
-    pick_place supports this.
+    With a virtual `clock` the server answers at once: the station's policy.delay_ms is its latency, in every protocol.
 
     Raises:
         RuntimeFault: If an option is invalid.
@@ -133,14 +131,14 @@ def build_server(options: argparse.Namespace, clock: Clock | None = None) -> Sta
     """
     import robots
 
-    if clock is not None and (options.protocol, options.behaviour) != ("openpi", "pick_place"):
+    if clock is not None and options.latency_ms:
         raise SetupError(
-            f"{options.protocol} with --behaviour {options.behaviour} in lockstep; allowed: openpi with pick_place"
+            f"--latency-ms {options.latency_ms:g} in lockstep, where real time does not count; allowed: 0, and "
+            "policy.delay_ms in the deployment or the checkpoint"
         )
     robot = robots.load_robot(options.robot, options.groups)
     rate = options.rate or robot.control_rate
     played = _spoken(_script(robot, rate, options, clock), robot, rate, options)
-    options.declared = clock is not None
     return _PROTOCOLS[options.protocol](robot, rate, played, options)
 
 
@@ -148,9 +146,7 @@ def _openpi(robot: Robot, rate: float, script: Script, options: argparse.Namespa
     from runtime.standins.openpi_server import Behaviour, OpenpiServer
 
     latency = options.latency_ms / 1e3
-    behaviour = Behaviour(
-        options.horizon, rate, latency, options.fault, options.seed, _rtc(options), options.declared
-    )
+    behaviour = Behaviour(options.horizon, rate, latency, options.fault, options.seed, _rtc(options))
     return OpenpiServer(robot, behaviour, options.port, script)
 
 
@@ -257,7 +253,7 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
             "--noise and --failure-rate are for --behaviour pick_place; no other fails on purpose"
         )
     if options.behaviour == "chase":
-        return ChaseScript(robot, options.horizon, rate, options.name)
+        return ChaseScript(robot, options.horizon, rate, options.name, clock)
     if options.behaviour == "gesture":
         return WavingScript(robot, options.horizon, rate, options.seed, options.name)
     skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)

@@ -111,6 +111,11 @@ class Runs:
             "episode": self.last_episode,
         }
 
+    @property
+    def provenance(self) -> Provenance:
+        """What the manifest of the next episode says about the station, as of the last set-up."""
+        return self._provenance
+
     def update_provenance(self, **changes: Any) -> None:
         """Change fields of Provenance (specification, checkpoint, bench) for the manifests of later episodes."""
         self._provenance = replace(self._provenance, **changes)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import uuid
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ from runtime.ipc.shared_state import SharedState
 from runtime.processes.control.process import make_sink, make_tick
 from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.builders import MakePolicy, make_policy
+from runtime.processes.coordinator.inference.requests import PolicyResponse
 from runtime.processes.coordinator.inference.runners import LockstepRunner, Runner
 from runtime.processes.guard.process import Guard
+from runtime.processes.lockstep.response_delay import draw_delay
 from runtime.processes.media.process import Media, make_recorder
 from runtime.processes.media.recorder import ClosedEpisode
 from runtime.processes.media.unclosed_episodes import Close, at_once
@@ -33,6 +36,7 @@ from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink, Source
 
 _HOLDER = "lockstep"
+_ROUNDING = 1e-6  # [ticks] that a delay of whole ticks may lie above them
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +95,7 @@ class Lockstep:
         recorder = make_recorder(spec, clock.now, patient=True)
         self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
-        self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
+        self._runner = around.runner or LockstepRunner(self.delayed)
         self.coordinator = assemble(spec, self.shared, clock, self._runner, around.client_clock, peers.policy)
         self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
         self.step = 0
@@ -116,6 +120,20 @@ class Lockstep:
         self._runner.tick()
         self.step += 1
         self._advance_clock()
+
+    def delayed(self, result: Any) -> tuple[Any, int]:
+        """Return what a call to the policy returned, a response with its declared latency, and its delay [ticks].
+
+        Neither depends on how long the call took.
+        """
+        ticks = self.spec.deployment.lockstep.delay_ticks
+        if not isinstance(result, PolicyResponse):
+            return result, ticks
+        provenance, number = self.coordinator.runs.provenance, self.coordinator.inference.metrics.answers
+        seconds = draw_delay(provenance.spec, provenance.bench.get("seed", 0), number)
+        if seconds is None:
+            return replace(result, seconds=ticks / self.spec.rate), ticks
+        return replace(result, seconds=seconds), math.ceil(seconds * self.spec.rate - _ROUNDING)
 
     def _advance_clock(self) -> None:
         """Advance the clock to the next tick, computed from the start: tick k is exactly at k / rate."""

@@ -8,21 +8,18 @@ while an episode is being closed. Leases and the validity of commands use real t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import zmq
 
 from runtime.core import process_limits as descriptors
 from runtime.core.clock import Clock, MonotonicClock, VirtualClock
-from runtime.core.errors import PolicyError, SetupError
+from runtime.core.errors import SetupError
 from runtime.core.realtime import LOCKSTEP
 from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.session_state import SessionState
 from runtime.processes.control.process import Lateness
-from runtime.processes.coordinator.inference.requests import PolicyResponse
 from runtime.processes.coordinator.inference.runners import DeclaredRunner
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import EStopServer
@@ -41,25 +38,6 @@ _FIGURES_EVERY = 30  # [ticks]
 _ON_DEMAND = ("step", "preview", "manual")  # modes that wait for a person, in real time
 Over = Callable[[bool], str]
 """Called before each tick with whether a run is active; returns why the run is over, or ""."""
-
-
-def declared_delay(rate: float) -> Callable[[Any], tuple[Any, int]]:
-    """Return a function that maps a policy's response to (response, delay in ticks), from its own timing.
-
-    Other results, such as that of connecting, have a delay of one tick.
-    """
-
-    def told(result: Any) -> tuple[Any, int]:
-        if not isinstance(result, PolicyResponse):
-            return result, 1
-        ms = result.chunk.timing.get("policy.infer_ms", 0.0)
-        if not 0.0 <= ms < math.inf:
-            raise PolicyError(
-                f"the answer's policy_timing.infer_ms is {ms}: lockstep goes by it; allowed: 0 or more"
-            )
-        return replace(result, seconds=ms / 1e3), math.ceil(ms / 1e3 * rate - 1e-6)
-
-    return told
 
 
 class _TickingClock(Clock):
@@ -105,7 +83,7 @@ class ServedLockstep(Lockstep):
         self._exports = ExportQueue(settings.data, settings.recording.export)
         start_repair(settings.episodes_dir, settings.station, self._exports.submit)
         self._previews = Previews(spec)
-        self._asking = DeclaredRunner(declared_delay(spec.rate))
+        self._asking = DeclaredRunner(self.delayed)
         around = LockstepEnvironment(
             runner=self._asking,
             client_clock=self._people,

@@ -33,7 +33,8 @@ from runtime.station.checks import check_deployment
 from tests.runtime.lockstep_station import column
 from tests.runtime.simulation.tabletop_station import DEPLOYMENTS, SlowEye
 
-LINE = "openpi --robot agilex_piper --behaviour pick_place --port 0 --seed 3 --noise {} --latency-ms {}"
+LINE = "openpi --robot agilex_piper --behaviour pick_place --port 0 --seed 3 --noise {}"
+DELAYS_MS = (80, 250)  # of the two policies
 TURNS = 200_000
 
 
@@ -59,9 +60,9 @@ class Operator:
         self._until(SessionState.IDLE)
         self._give("lease_claim")
 
-    def trial(self, policy: str, seed: int, seconds: float) -> None:
+    def trial(self, policy: dict[str, Any], seed: int, seconds: float) -> None:
         bench = {"id": str(uuid.uuid4()), "seed": seed}
-        self._give("setup", policy={"url": policy}, bench=bench)
+        self._give("setup", policy=policy, bench=bench)
         self._until(SessionState.READY, SessionState.IDLE)
         session, runs = self.station.coordinator.session, self.station.coordinator.runs
         assert session.state is SessionState.READY, session.reason
@@ -119,9 +120,9 @@ def courses(
     slow_s: float = 0.0,
     make: type[Tabletop | ContactTabletop] = Tabletop,
 ) -> list[Course]:
-    """Trials of (policy, seed, seconds), at a bench whose policies may take longer than they say."""
+    """Trials of (policy, seed, seconds), at a bench whose policies may take longer than is declared."""
     clock = VirtualClock()
-    lines = [LINE.format(1, 80), LINE.format(14, 250) + " --failure-rate 0.4"]
+    lines = [LINE.format(1), LINE.format(14) + " --failure-rate 0.4"]
     servers: list[Any] = [
         serve.build_server(serve.parser().parse_args(shlex.split(line)), clock) for line in lines
     ]
@@ -142,7 +143,7 @@ def courses(
     with closing(ServedLockstep(made, clock, over, peers=peers)) as station:
         operator = Operator(station, dawdles)
         for policy, seed, seconds in trials:
-            operator.trial(urls[policy], seed, seconds)
+            operator.trial({"url": urls[policy], "delay_ms": DELAYS_MS[policy]}, seed, seconds)
         found = operator.courses()
     for server in servers:
         server.close()
@@ -209,7 +210,36 @@ def test_the_bench_is_the_one_that_is_asked_for() -> None:
     assert isinstance(around._tabletop, ContactTabletop)
 
 
-def test_only_a_server_that_can_declare_its_times_is_served() -> None:
-    given = serve.parser().parse_args(["gr00t", "--robot", "agilex_piper"])
-    with pytest.raises(SetupError, match="gr00t with --behaviour gesture in lockstep; allowed: openpi with"):
+PIPER = robots.load_robot("agilex_piper")
+PARTS = {group.name: list(range(group.slice.start, group.slice.stop)) for group in PIPER.groups}
+VIEWS = {camera.key: camera.key for camera in PIPER.cameras}
+WIRES: dict[str, dict[str, Any]] = {
+    "openpi": {},
+    "gr00t": {"dialect": "nested", "video": VIEWS, "state": PARTS, "actions": PARTS},
+    "lerobot": {"accept_pickle": True, "policy_type": "act", "checkpoint": "user/ckpt", "images": VIEWS},
+}
+
+
+@pytest.mark.parametrize("protocol", WIRES)
+def test_a_server_of_any_protocol_drives_the_bench_and_its_delay_is_the_stations(
+    protocol: str, tmp_path: Path
+) -> None:
+    clock = VirtualClock()
+    line = f"{protocol} --robot agilex_piper --behaviour pick_place --port 0"
+    server = serve.build_server(serve.parser().parse_args(shlex.split(line)), clock)
+    with closing(server):
+        policy = {"kind": protocol, "url": str(server.start()["url"]), "delay_ms": [70.0, 230.0]}
+        given = [f'data_dir="{tmp_path}"', "lease.ttl_s=600", "recording.export=false"]
+        station = lockstep.station(DEPLOYMENTS / "tabletop.toml", given, clock)
+        with closing(station):
+            operator = Operator(station, 0)
+            operator.trial(policy | WIRES[protocol], 4, 20.0)
+            (course,) = operator.courses()
+    assert course.truth["success"] is True
+    assert course.delays == {3, 7}
+
+
+def test_a_server_that_takes_real_time_is_refused() -> None:
+    given = serve.parser().parse_args(["gr00t", "--robot", "agilex_piper", "--latency-ms", "80"])
+    with pytest.raises(SetupError, match="--latency-ms 80 in lockstep, where real time does not count; allowed"):
         serve.build_server(given, VirtualClock())

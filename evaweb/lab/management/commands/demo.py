@@ -137,12 +137,18 @@ class Command(BaseCommand):
         """Start bench, policies and station in one process on a virtual clock."""
         robot, how = options["robot"], benches_of(options)
         policies = {name: (how.skill(name), known_port(name)) for name in POLICIES}
-        assignments = [f'robot="{robot}"', f'data_dir="{settings.DATA_DIR}"', *options["set"]]
+        assignments = [
+            f'robot="{robot}"',
+            f'data_dir="{settings.DATA_DIR}"',
+            f"policy.delay_ms={POLICIES[SKILLED].latency_ms}",
+            *options["set"],
+        ]
         assignments += _COLLECTS if options["collect"] else ()
         paced = () if options["evaluate"] else ("--paced",)  # in real time for people who watch
         program = programs.lockstep(str(deployment), assignments, robot, policies, (*how.options, *paced))
         for name, url in lab.processes.start(program)["policies"].items():
-            demo_rows.demo_checkpoint(name=name, description=POLICIES[name][0], policy={"url": url})
+            served = {"url": url, "delay_ms": POLICIES[name].latency_ms}
+            demo_rows.demo_checkpoint(name=name, description=POLICIES[name].description, policy=served)
         return Bench(deployment, assignments, runs=True)
 
     def _bench(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
@@ -150,12 +156,14 @@ class Command(BaseCommand):
         robot, how = options["robot"], benches_of(options)
         bench = lab.processes.begin(programs.tabletop(robot, how.options))
         servers = {
-            name: lab.processes.begin(programs.policy(name, robot, how.skill(name), known_port(name)))
+            name: lab.processes.begin(programs.policy(name, robot, how.server(name), known_port(name)))
             for name in POLICIES
         }
         node, served = bench(), {name: server()["url"] for name, server in servers.items()}
-        for name, (description, _) in POLICIES.items():
-            demo_rows.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
+        for name, scripted in POLICIES.items():
+            demo_rows.demo_checkpoint(
+                name=name, description=scripted.description, policy={"url": served[name]}
+            )
         assignments = [
             f'robot="{robot}"',
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',

@@ -348,7 +348,7 @@ class Inference:
         step, rows, ik = response.observation.step, response.commands.rows, response.ik
         self.requests.log_ik_problems(response)
         self._wanted = False
-        self.metrics.add_response(response.seconds, response.age, ik)
+        self.metrics.add_response(response.seconds, response.age, ik, response.wall_seconds)
         self._commitment.add_chunk(
             response.number, response.chunk, step, response.requested_while_stopped, self._generation, rows
         )

@@ -44,14 +44,19 @@ class PolicyMetrics:
         self.ik: dict[str, Any] = {}  # of the newest response
         self.poses: dict[str, Any] = {}  # of all responses: solved rows, flagged rows, largest errors
         self.answers = self.dropped = self.mistimed = self.starved = self.lost = 0
-        self.latencies: deque[float] = deque(maxlen=_KEPT)  # [s]
+        self.latencies: deque[float] = deque(maxlen=_KEPT)  # on the station's clock [s]
+        self.wall_latencies: deque[float] = deque(maxlen=_KEPT)  # on the machine's clock [s]
         self.ages: deque[float] = deque(maxlen=_KEPT)  # age of the observation at the request [s]
         self.delays: deque[int] = deque(maxlen=_KEPT)  # control steps, measured
 
     def add_response(
-        self, seconds: float, age: float | None = None, ik: Mapping[str, Any] | None = None
+        self,
+        seconds: float,
+        age: float | None = None,
+        ik: Mapping[str, Any] | None = None,
+        wall_seconds: float | None = None,
     ) -> None:
-        """Add a response with its latency `seconds` [s].
+        """Add a response with its latency `seconds` on the station's clock, `wall_seconds` on the machine's [s].
 
         `age` is the age of its observation at the request [s], None if unknown. `ik` are the figures of its poses
         (`requests.ik_figures`); {} or None for a chunk of joints.
@@ -62,6 +67,8 @@ class PolicyMetrics:
         self.ik = dict(ik or {})
         self.answers += 1
         self.latencies.append(seconds)
+        if wall_seconds is not None:
+            self.wall_latencies.append(wall_seconds)
         if age is not None:
             self.ages.append(age)
 
@@ -102,6 +109,7 @@ class PolicyMetrics:
             "starved": self.starved,
             "lost": self.lost,
             "latency_ms": _spread([seconds * 1000 for seconds in latencies]),
+            "wall_latency_ms": _spread([seconds * 1000 for seconds in self.wall_latencies]),
             "delay_steps": _spread(delays),
             "ik": dict(self.poses) or None,
             "observation_age_ms": _spread([seconds * 1000 for seconds in ages]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -72,7 +73,8 @@ class MissBound:
 class PolicyResponse:
     """Result of a completed inference: chunk, duration [s], observation, and joint commands.
 
-    `commands` are the rows of `chunk`, converted to joint commands. If a row was refused, they end before it, and
+    `seconds` is the latency on the station's clock: in lockstep the declared one, while `wall_seconds` is measured on
+    the machine's clock everywhere. `commands` are the rows of `chunk`, converted to joint commands. If a row was refused, they end before it, and
     `refused` is the reason, else "". If `requested_while_stopped`, the robot was at rest until the response. `eef` is
     the origin of the observation's poses: "measured" by the robot, or "fk" from its joints.
     """
@@ -86,6 +88,7 @@ class PolicyResponse:
     eef: Literal["measured", "fk"] = "fk"
     ik: Mapping[str, Any] = field(default_factory=dict)  # from `ik_figures`; {} for joints
     refused: str = ""
+    wall_seconds: float = 0.0
     number: int = 0  # of its chunk, set on arrival
 
     def status(self, now: float) -> dict[str, Any]:
@@ -223,7 +226,9 @@ class PolicyRequests:
                 begun = self._clock.now()
                 completed = sample if measured else replace(sample, eef=self._spaces.eef_of(sample.qpos))
                 age = self._clock.now() - min(completed.captured.values())
+                wall = time.monotonic()
                 chunk = policy.infer(completed, conditioning)
+                wall = time.monotonic() - wall
             except PolicyLostError:  # the next connection knows nothing of the reset or resume
                 self._fresh, self._held = self._fresh or fresh, self._held or holding
                 raise
@@ -235,7 +240,9 @@ class PolicyRequests:
             commands, refused = (
                 self._within(commands, onset.first_row, fresh or holding) if executed else (commands, "")
             )
-            return PolicyResponse(chunk, seconds, completed, commands, waited, age, source, ik, refused)
+            return PolicyResponse(
+                chunk, seconds, completed, commands, waited, age, source, ik, refused, wall
+            )
 
         return self.runner.submit(infer)
 

@@ -19,6 +19,8 @@ from runtime.core.sentences import fixed
 log = logging.getLogger(__name__)
 _CODE_FAILED = fixed("policy.code_failed", "the policy's own code failed")
 Result = TypeVar("Result")
+Declared = Callable[[Any], tuple[Any, int]]
+"""Maps what a call returned to the result to return, and the delay of that result [ticks]."""
 
 
 class Runner(ABC):
@@ -113,13 +115,13 @@ class DeclaredRunner(Runner):
     """Runner that executes calls between two ticks; a call's result is ready after a declared number of ticks.
 
     The function `declared` receives what a call returned. It returns the result of the call, and the number of ticks
-    after which that result is ready. Calls start at `start_waiting`. They run on a thread, so that the ticking thread
+    after which that result is ready, at least one. Calls start at `start_waiting`. They run on a thread, so that the ticking thread
     can answer commands meanwhile; no tick may pass while a call is running. Therefore the step at which a result is
     ready does not depend on the call's real duration.
     """
 
-    def __init__(self, declared: Callable[[Any], tuple[Any, int]]) -> None:
-        self._declared = declared  # result -> (result to return, its delay [ticks])
+    def __init__(self, declared: Declared) -> None:
+        self._declared = declared
         self._thread = ThreadRunner()
         self._now = 0
         self._waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
@@ -166,20 +168,27 @@ class DeclaredRunner(Runner):
 
 
 class LockstepRunner(Runner):
-    """Runner that calls at once; the result is ready `delay` ticks later, the same on every run."""
+    """Runner that calls at once; the result is ready `delay` ticks later, the same on every run.
 
-    def __init__(self, delay: int) -> None:
+    `delay` is a number of ticks, or `declared` as of a DeclaredRunner.
+    """
+
+    def __init__(self, delay: int | Declared) -> None:
         self._delay = delay
         self._now = 0
         self._due: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
 
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
+        ticks = self._delay if isinstance(self._delay, int) else 0
         try:
-            future.set_result(_call_logged(call)())
+            result = _call_logged(call)()
+            if callable(self._delay):
+                result, ticks = self._delay(result)
+            future.set_result(result)
         except RuntimeFault as error:
             future.set_exception(error)
-        self._due[future] = self._now + self._delay
+        self._due[future] = self._now + ticks
         return future
 
     def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:

@@ -212,14 +212,14 @@ def test_what_a_person_moves_in_between_takes_its_time_and_then_it_stands_still(
 def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: Path) -> None:
     said = []
     for name, waits in (("quick", 0.0), ("slow", 0.02)):
-        made = stubbed(tmp_path / name, recording={"min_free_bytes": 0, "export": False})
+        made = stubbed(tmp_path / name, delay=3, recording={"min_free_bytes": 0, "export": False})
         client = Client(made)
         infer = client.policy.infer
 
         def slowly(*given: Any, infer: Any = infer, waits: float = waits) -> ActionChunk:
             threading.Event().wait(waits)
             chunk = infer(*given)
-            return ActionChunk(chunk.actions, timing={"policy.infer_ms": 100.0})
+            return ActionChunk(chunk.actions, timing={"policy.infer_ms": 5000.0})  # what it says has no effect
 
         client.policy.infer = slowly  # type: ignore[method-assign]
         client.turn(int(1000 * waits), 0.01)  # an operator who is slower too
@@ -234,7 +234,10 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
         said.append((client.robot.sent[:60], asked[:12], column(episode.rows, "time")[:55]))
         delays = list(client.station.coordinator.inference.metrics.delays)
         assert delays[2:]
-        assert set(delays[2:]) == {3}  # 100 ms, whatever they really took
+        assert set(delays[2:]) == {3}  # whatever they really took
+        figures = client.station.coordinator.inference.metrics.figures()
+        assert figures["latency_ms"]["max"] == pytest.approx(100.0)
+        assert figures["wall_latency_ms"]["p50"] >= 1000 * waits
         client.close()
     for quick, slow in zip(*said, strict=True):
         assert np.array_equal(quick, slow)
@@ -283,16 +286,6 @@ def test_a_recording_of_its_own_takes_its_time(client: Client) -> None:
     client.turn(2, 0.1)
     assert client.episode().frames > 20
     assert client.turn(20, 0.1) == 0
-
-
-def test_a_time_that_cannot_be_is_refused(client: Client) -> None:
-    infer = client.policy.infer
-    client.policy.infer = lambda *given: ActionChunk(  # type: ignore[method-assign]
-        infer(*given).actions, timing={"policy.infer_ms": -1.0}
-    )
-    client.accepted("setup")
-    client.until(SessionState.IDLE)
-    assert "policy_timing.infer_ms is -1.0: lockstep goes by it; allowed: 0 or more" in client.reason
 
 
 def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: Stubs) -> None:
