@@ -63,10 +63,11 @@ def gripper_of(key: str, tree: Urdf, table: GripperTable, dof: int) -> Gripper:
     if table.threshold is not None and not low < table.threshold < high:
         raise RobotError(f"{key}.gripper.threshold = {table.threshold}; allowed: between {low} and {high}")
     return Gripper(
-        **table.model_dump(exclude={"velocity", "tip", "hysteresis", "fingers", "apart"}),
+        **table.model_dump(exclude={"velocity", "tip", "hysteresis", "fingers", "apart", "force"}),
         hysteresis=_hysteresis(key, table),
         fingers=_fingers(key, tree, table.fingers),
         apart=_apart(key, table),
+        force=table.force,
     )
 
 
