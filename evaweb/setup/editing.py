@@ -13,7 +13,6 @@ from evaweb.plans.bench_checks import cameras_of
 from evaweb.plans.models import Reference
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import station_list
-from evaweb.stations.surroundings import AREA, BENCH
 from evaweb.trials.failures import failure_choices
 from evaweb.trials.models import Milestone, Position, Scene
 from evaweb.trials.scene_reading import (
@@ -25,17 +24,30 @@ from evaweb.trials.scene_reading import (
     scene_digest,
     scene_table,
 )
-from evaweb.trials.scene_writing import APART_M, table_of
+from evaweb.trials.scene_writing import table_of
+from evaweb.trials.tables import BENCH, EXAMPLE
+from runtime.benches.schema import Box, Disc
 
-# Sizes of the simulated bench [m], position and reach of its arms; a test compares them with the simulation.
+
+def _size(thing: Box | Disc) -> dict[str, Any]:
+    """Return how an object of the simulated bench is drawn from above: lengths in m."""
+    width, depth = thing.size[:2] if isinstance(thing, Box) else (2 * thing.radius, 2 * thing.radius)
+    return {
+        "title": thing.title,
+        "round": isinstance(thing, Disc),
+        "width": width,
+        "depth": depth,
+        "example": thing.example,
+    }
+
+
+# The simulated bench, with lengths in m, and position and reach of its arms.
 SIZES = {
-    "area": list(AREA),
-    "apart": APART_M,
-    "sides": [[-0.25, 0.0], [0.25, 0.0]],
-    "reach": 0.42,
-    "block": BENCH["block_edge"],
-    "plate": BENCH["plate_radius"],
-    "first": {"block": [-0.12, 0.28, 0], "plate": [0.1, 0.32]},
+    "area": BENCH.area,
+    "apart": [[*pair.objects, pair.distance] for pair in BENCH.apart],
+    "sides": BENCH.reach.sides,
+    "reach": BENCH.reach.distance,
+    "objects": {name: _size(thing) for name, thing in BENCH.objects.items()},
 }
 
 # Corners of the area in 4:3 images of the simulated overhead camera, as shares of width and height: near left, near
@@ -82,7 +94,7 @@ def new(source: Scene | None) -> dict[str, Any]:
     for row in (*table["positions"], *table["milestones"]):
         row["id"] = None
     if source is None:
-        laid = SIZES["first"] if station_list().filter(simulated=True).exists() else None
+        laid = EXAMPLE if station_list().filter(simulated=True).exists() else None
         table["positions"] = [PositionTable(number=1, bench=laid).model_dump()]
     state = {"scene": table, "seen": "", "kept": {}, "references": {}, **_around()}
     return {"scene": None, "source": source, "state": state, "trials": 0, "plans": []}

@@ -15,27 +15,33 @@ from numpy.typing import NDArray
 from evaweb.stations.robot_geometry import DrawnRobot
 from robots import urdf
 from robots.visuals import Visual
+from runtime.benches.schema import load_schema
 
 Float64 = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # x from, to, y from, y to [m]
 
-AREA: Rectangle = (-0.22, 0.22, 0.18, 0.40)  # area for objects
-# The simulated bench of runtime.simulation.bench.bench (a test compares the sizes): lengths [m], colours from 0 to 1.
+_TABLETOP = load_schema("tabletop")
+_BLOCK, _PLATE = _TABLETOP.box("block"), _TABLETOP.disc("plate")
+
+
+def _shade(parts: Sequence[int]) -> list[float]:
+    """Return an opaque colour with parts from 0 to 1."""
+    return [*(part / 255 for part in parts), 1.0]
+
+
+_X_FROM, _X_TO, _Y_FROM, _Y_TO = _TABLETOP.area
+AREA: Rectangle = (_X_FROM, _X_TO, _Y_FROM, _Y_TO)  # area for objects
+# The simulated bench: lengths [m], colours from 0 to 1.
 BENCH = {
-    "block_edge": 0.04,
-    "plate_radius": 0.075,
-    "plate_height": 0.012,
-    "area": list(AREA),
-    "plate_colour": [226 / 255, 234 / 255, 244 / 255, 1.0],
-    "plate_rim_colour": [58 / 255, 104 / 255, 190 / 255, 1.0],
-    "block_colours": [
-        [226 / 255, 74 / 255, 22 / 255, 1.0],
-        [40 / 255, 150 / 255, 70 / 255, 1.0],
-        [150 / 255, 70 / 255, 170 / 255, 1.0],
-        [235 / 255, 190 / 255, 40 / 255, 1.0],
-    ],
+    "block_edge": _BLOCK.size[0],
+    "plate_radius": _PLATE.radius,
+    "plate_height": _PLATE.height,
+    "area": _TABLETOP.area,
+    "plate_colour": _shade(_PLATE.colour),
+    "plate_rim_colour": _shade(_PLATE.rim_colour),
+    "block_colours": [_shade(colour) for colour in (_BLOCK.colour, *_TABLETOP.distractors.colours)],
 }
-_WOOD = [176 / 255, 164 / 255, 146 / 255, 1.0]
+_WOOD = _shade(_TABLETOP.table_colour)
 _STEEL = [96 / 255, 102 / 255, 110 / 255, 1.0]
 _THICKNESS = 0.03
 _LEAST_TABLE: Rectangle = (-0.6, 0.6, -0.2, 0.6)  # AREA with a margin

@@ -5,7 +5,6 @@ Rows used by trials or frozen plans are not changed; concurrent edits are detect
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -21,7 +20,6 @@ from evaweb.accounts.roles import Role, require_role
 from evaweb.core.canonical_json import difference
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.core.write_conflicts import once_more
-from evaweb.stations.surroundings import AREA
 from evaweb.trials.models import Milestone, Position, Scene
 from evaweb.trials.scene_reading import (
     FIELDS,
@@ -36,16 +34,13 @@ from evaweb.trials.scene_reading import (
     scene_table,
     values_of,
 )
-from evaweb.trials.tables import check_milestones
+from evaweb.trials.tables import BENCH, check_milestones, simulated_bench
 from runtime.core.sentences import Pattern
 
 _SCENE_DOES_NOT_EXIST_ANY = Pattern(
     "trials.scene_writing.scene_does_not_exist_any",
     "scene {name!r:.80} does not exist any more: nothing was saved",
 )
-
-APART_M = 0.15  # least distance between the centres of block and plate; runtime.simulation.bench.layout refuses less
-
 
 _IDS = {
     "positions": {"__all__": {"id"}},
@@ -199,21 +194,7 @@ def _position_written(row: Position, values: Mapping[str, Any], place: str, prot
 
 def _bench_problem(bench: Mapping[str, Any]) -> str:
     """Return why a simulated bench would refuse this layout, "" if it would accept."""
-    x_from, x_to, y_from, y_to = AREA
-    for name in ("block", "plate"):
-        x, y = bench[name][:2] if name in bench else (x_from, y_from)
-        if not (x_from <= x <= x_to and y_from <= y <= y_to):
-            return (
-                f"{name} at x {1000 * x:.0f}, y {1000 * y:.0f} mm; allowed on a simulated bench: "
-                f"x {1000 * x_from:.0f} to {1000 * x_to:.0f}, y {1000 * y_from:.0f} to {1000 * y_to:.0f} mm"
-            )
-    if {"block", "plate"} <= bench.keys():
-        apart = math.dist(bench["block"][:2], bench["plate"][:2])
-        if apart < APART_M:
-            return (
-                f"block and plate are {1000 * apart:.0f} mm apart; allowed: {1000 * APART_M:.0f} mm or more"
-            )
-    return ""
+    return next(BENCH.problems(simulated_bench(bench) or {}), "")
 
 
 def _write_milestones(scene: Scene, tables: Sequence[MilestoneTable]) -> list[Fault]:

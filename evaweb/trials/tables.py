@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -13,10 +14,12 @@ import pydantic
 from django.core.exceptions import ValidationError
 
 from evaweb.trials.failure_text import is_unspecified
+from runtime.benches.schema import load_schema
 from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
-_PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
+BENCH = load_schema("tabletop")  # the simulated bench that positions are laid out for
+EXAMPLE = {name: thing.example for name, thing in BENCH.objects.items()}
 _OBJECT_NAME = re.compile(r"[^\W_](?:[\w .-]{0,38}[\w.-])?")
 _SMALLEST, _LARGEST = 0.005, 1.0  # side of an object [m]
 _OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
@@ -53,7 +56,7 @@ def check_tags(given: object) -> None:
         raise ValidationError(_sentence(given, "each tag once"))
 
 
-TRUTHS = ("grasped", "lifted", "over_plate", "placed")  # milestones that the simulated bench reports
+TRUTHS = tuple(BENCH.milestones)  # milestones that the simulated bench reports
 
 
 def check_term(given: str) -> None:
@@ -76,15 +79,14 @@ def check_milestones(texts: Sequence[str]) -> None:
 def check_bench(given: object) -> None:
     """Raise ValidationError unless `given` is None or the layout of a bench.
 
-    "block": [x, y, yaw] and "plate": [x, y] are for simulated benches. "objects" are for benches laid out by people:
-    name -> [x, y, yaw, width, depth]. Lengths are in metres, yaw in degrees.
+    The objects of the simulated bench, such as "block": [x, y, yaw] and "plate": [x, y], are keys of their own.
+    "objects" are for benches laid out by people: name -> [x, y, yaw, width, depth]. Lengths are in metres, yaw in
+    degrees.
     """
     if given is None:
         return
     if not isinstance(given, Mapping):
-        raise ValidationError(
-            _sentence(given, 'a table such as {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]}')
-        )
+        raise ValidationError(_sentence(given, f"a table such as {json.dumps(EXAMPLE)}"))
     laid = {key: value for key, value in given.items() if key != "objects"}
     objects = given.get("objects", {})
     if not isinstance(objects, Mapping):
@@ -98,7 +100,7 @@ def check_bench(given: object) -> None:
 
 def simulated_bench(given: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return the part of a position's layout that a simulated bench can reset itself."""
-    return None if given is None else {key: given[key] for key in _PLACES if key in given}
+    return None if given is None else {key: given[key] for key in BENCH.objects if key in given}
 
 
 def _object_problem(name: object, value: object) -> str:
@@ -111,9 +113,9 @@ def _object_problem(name: object, value: object) -> str:
 
 
 def _place_problem(key: object, value: object) -> str:
-    if key not in _PLACES:
-        return f"{key}: unknown key; allowed: {', '.join(_PLACES)}, objects"
-    return _numbers_problem(str(key), value, _PLACES[str(key)])
+    if key not in BENCH.objects:
+        return f"{key}: unknown key; allowed: {', '.join(BENCH.objects)}, objects"
+    return _numbers_problem(str(key), value, BENCH.objects[str(key)].numbers)
 
 
 def _numbers_problem(key: str, value: object, parts: Sequence[str]) -> str:

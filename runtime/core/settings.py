@@ -65,9 +65,10 @@ def _sentence(
     if kind == "missing":
         return f"{where}: {name} is missing and has no default"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        where = origin.get((*key, "kind"), where)
-        value = f"= {error['input']['kind']!r:.200}" if "kind" in error["input"] else "is missing"
-        return f"{where}: {name}.kind {value}: must be one of {error['ctx']['expected_tags']}"
+        tag = error["ctx"].get("discriminator", "'kind'").strip("'")
+        where = origin.get((*key, tag), where)
+        value = f"= {error['input'][tag]!r:.200}" if tag in error["input"] else "is missing"
+        return f"{where}: {name}.{tag} {value}: must be one of {error['ctx']['expected_tags']}"
     if kind == "secret":
         return f"{where}: {name}: {error['msg']}"
     if kind in ("model_type", "model_attributes_type", "dict_type"):

@@ -42,19 +42,19 @@ class Checkpoint(Settings):
     name: Label = ""
 
 
-class Positions(Settings):
-    """Requested positions on the bench in the world frame: x, y [m], yaw [degrees]; absent: anywhere."""
-
-    block: list[float] | None = Field(default=None, min_length=3, max_length=3)
-    plate: list[float] | None = Field(default=None, min_length=2, max_length=2)
+Place = Annotated[list[float], Field(min_length=2, max_length=3)]
 
 
 class BenchRequest(Settings):
-    """Requested layout of a simulated bench; `id` names this reset, and is generated if absent."""
+    """Requested layout of a simulated bench; `id` names this reset, and is generated if absent.
+
+    `positions` are the places of the bench's objects by name in the world frame: x, y [m] and, of objects that can be
+    turned, yaw [degrees]. Objects without a place are laid anywhere. The bench's own schema decides what it accepts.
+    """
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     seed: int = Field(ge=0, le=_HIGHEST_SEED)
-    positions: Positions | None = None
+    positions: Annotated[dict[str, Place], Field(max_length=100)] | None = None
 
 
 class LeastTimes(Settings):

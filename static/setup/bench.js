@@ -10,13 +10,25 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowD
 export const THING = t("page.bench.thing", "thing on the bench"); // what screen readers call an object that can be moved
 const REACH = 2000; // bound [mm] on where the lab's own objects may lie, whatever the area is
 
-/** Return the objects on the bench of a position: [{key, name, kind, x, y, yaw, width, depth}], in mm and degrees. */
+const WORDS = { plate: t("page.bench.plate", "plate"), block: t("page.bench.block", "block") }; // other titles are the bench's own
+
+/** Return what people call an object of the simulated bench. */
+export function nameOf(key, sizes) {
+  return WORDS[key] ?? sizes.objects[key].title;
+}
+
+/**
+ * Return the objects on the bench of a position: [{key, name, kind, round, x, y, yaw, width, depth}], in mm and degrees. `kind`
+ * is "object" for those of the lab, else the key of one of the simulated bench, as of which `sizes` has the sizes.
+ */
 export function things(bench, sizes) {
   const found = [];
-  if (bench?.plate) found.push({ key: "plate", name: t("page.bench.plate", "plate"), kind: "plate", yaw: 0, ...at(bench.plate), ...square(2 * sizes.plate) });
-  if (bench?.block) found.push({ key: "block", name: t("page.bench.block", "block"), kind: "block", yaw: bench.block[2], ...at(bench.block), ...square(sizes.block) });
+  for (const [key, { round, width, depth }] of Object.entries(sizes.objects)) {
+    const place = bench?.[key];
+    if (place) found.push({ key, name: nameOf(key, sizes), kind: key, round, yaw: round ? 0 : place[2], ...at(place), width: mm(width), depth: mm(depth) });
+  }
   for (const [name, place] of Object.entries(bench?.objects ?? {}).sort(([a], [b]) => a.localeCompare(b))) {
-    found.push({ key: `object ${name}`, name, kind: "object", yaw: place[2], ...at(place), width: mm(place[3]), depth: mm(place[4]) });
+    found.push({ key: `object ${name}`, name, kind: "object", round: false, yaw: place[2], ...at(place), width: mm(place[3]), depth: mm(place[4]) });
   }
   return found;
 }
@@ -25,8 +37,7 @@ export function things(bench, sizes) {
 export function placed(bench, thing, change) {
   const { x, y, yaw, width, depth } = { ...thing, ...change };
   const place = [metres(x), metres(y)];
-  if (thing.kind === "plate") return { ...bench, plate: place };
-  if (thing.kind === "block") return { ...bench, block: [...place, turned(yaw)] };
+  if (thing.kind !== "object") return { ...bench, [thing.kind]: thing.round ? place : [...place, turned(yaw)] };
   return { ...bench, objects: { ...bench.objects, [thing.name]: [...place, turned(yaw), metres(width), metres(depth)] } };
 }
 
@@ -43,14 +54,14 @@ export function stepped(thing, { key, shiftKey, ctrlKey, altKey, metaKey }) {
   const [along, turns] = [ARROWS[key], { PageUp: 1, PageDown: -1 }[key]];
   const step = shiftKey ? 1 : STEP;
   if (along) return { x: thing.x + step * along[0], y: thing.y + step * along[1] };
-  if (turns && thing.kind !== "plate") return { yaw: thing.yaw + turns * (shiftKey ? 1 : TURN) };
+  if (turns && !thing.round) return { yaw: thing.yaw + turns * (shiftKey ? 1 : TURN) };
   return null;
 }
 
 /** Say in words where an object lies. */
-export function whereabouts({ name, kind, x, y, yaw }) {
+export function whereabouts({ name, round, x, y, yaw }) {
   const at = { name, x: n(x), y: n(y), yaw: n(yaw) };
-  if (kind === "plate") return t("page.bench.at", "{name}: x {x} mm, y {y} mm", at);
+  if (round) return t("page.bench.at", "{name}: x {x} mm, y {y} mm", at);
   return t("page.bench.turned", "{name}: x {x} mm, y {y} mm, turned by {yaw}°", at);
 }
 
@@ -63,8 +74,8 @@ export function without(bench, thing) {
 }
 
 /** Return the corners of an object [mm]; a circle becomes a polygon of ROUND corners. */
-export function outline({ kind, x, y, yaw, width, depth }) {
-  if (kind === "plate") {
+export function outline({ round, x, y, yaw, width, depth }) {
+  if (round) {
     const turns = Array.from({ length: ROUND }, (_, k) => (2 * Math.PI * k) / ROUND);
     return turns.map((turn) => [x + (width / 2) * Math.cos(turn), y + (width / 2) * Math.sin(turn)]);
   }
@@ -85,9 +96,9 @@ export function problems(bench, sizes) {
   }
   all.forEach((one, index) => {
     for (const other of all.slice(index + 1)) {
-      const least = one.kind !== "object" && other.kind !== "object" ? mm(sizes.apart) : radius(one) + radius(other);
-      const apart = Math.hypot(one.x - other.x, one.y - other.y);
-      if (apart < least - 1e-6) said.push(t("page.bench.apart", "{one} and {other} are {apart} mm apart; at least {least} mm are needed", { one: one.name, other: other.name, apart: apart.toFixed(0), least: least.toFixed(0) }));
+      const least = apart(one, other, sizes) ?? radius(one) + radius(other);
+      const found = Math.hypot(one.x - other.x, one.y - other.y);
+      if (found < least - 1e-6) said.push(t("page.bench.apart", "{one} and {other} are {apart} mm apart; at least {least} mm are needed", { one: one.name, other: other.name, apart: found.toFixed(0), least: least.toFixed(0) }));
     }
   });
   return said;
@@ -119,13 +130,13 @@ export function ground(sizes, { x, y, width, height }) {
 
 /** Return the markup of one object; `inside` is markup that moves and turns with it. */
 export function drawn(thing, { attributes = "", inside = "", words = "" } = {}) {
-  const { kind, x, y, yaw, width, depth } = thing;
+  const { kind, round, x, y, yaw, width, depth } = thing;
   const shape =
-    kind === "plate"
+    round
       ? `<circle class="shape" r="${n(width / 2)}"/><circle class="rim" r="${n(width / 2 - 9)}"/>`
       : `<rect class="shape" x="${n(-width / 2)}" y="${n(-depth / 2)}" width="${n(width)}" height="${n(depth)}" rx="2"/><path class="ahead" d="M0 0V${n(-depth / 2)}"/>`;
   const text = words && `<text class="thing-name" x="${n(x)}" y="${n(-y + Math.max(width, depth) / 2 + 16)}">${escaped(words)}</text>`;
-  return `<g class="thing thing-${kind}" ${attributes}><g transform="translate(${n(x)} ${n(-y)}) rotate(${n(-yaw)})">${shape}${inside}</g>${text}</g>`;
+  return `<g class="thing thing-${look(kind, round)}" ${attributes}><g transform="translate(${n(x)} ${n(-y)}) rotate(${n(-yaw)})">${shape}${inside}</g>${text}</g>`;
 }
 
 /**
@@ -160,16 +171,23 @@ export function n(value) {
   return String(Math.round(value * 100) / 100);
 }
 
-function radius({ kind, width, depth }) {
-  return kind === "plate" ? width / 2 : Math.hypot(width, depth) / 2;
+/** Return the class of an object's look in drawings. */
+export function look(kind, round) {
+  return kind === "object" ? "own" : round ? "disc" : "box";
+}
+
+/** Return the least distance of two objects of the simulated bench [mm]; undefined if it declares none. */
+function apart({ kind }, { kind: other }, sizes) {
+  const declared = sizes.apart.find(([a, b]) => (a === kind && b === other) || (a === other && b === kind));
+  return declared && mm(declared[2]);
+}
+
+function radius({ round, width, depth }) {
+  return round ? width / 2 : Math.hypot(width, depth) / 2;
 }
 
 function at([x, y]) {
   return { x: mm(x), y: mm(y) };
-}
-
-function square(side) {
-  return { width: mm(side), depth: mm(side) };
 }
 
 function mm(value) {

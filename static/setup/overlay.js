@@ -3,7 +3,7 @@
 // dragged in the picture too. A file of the user's own never leaves the browser.
 
 import { get } from "../site/api.js";
-import { escaped, moved, n, outline, stepped, THING, things, whereabouts } from "./bench.js";
+import { escaped, look, moved, n, outline, stepped, THING, things, whereabouts } from "./bench.js";
 import { projection, seen } from "./plane.js";
 import { t } from "../site/sentences.js";
 
@@ -156,7 +156,7 @@ export class Overlay {
     const h = projection([[left, near], [right, near], [right, far], [left, far]], this.#corners);
     const shape = (points, kind, more = "") => `<polygon class="${kind}" ${more} points="${points.map((point) => seen(h, point).map((share) => n(SIDE * share)).join(" ")).join(", ")}"/>`;
     const movable = (thing) => `data-over="${escaped(thing.key)}"${this.#changed ? ` tabindex="0" role="button" aria-roledescription="${escaped(THING)}" aria-label="${escaped(whereabouts(thing))}"` : ""}`;
-    const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${thing.kind}`, movable(thing)))] : [];
+    const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${look(thing.kind, thing.round)}`, movable(thing)))] : [];
     const handles = this.#corners.map(
       ([x, y], index) => `<circle class="corner" data-corner="${index}" cx="${n(SIDE * x)}" cy="${n(SIDE * y)}" r="14" tabindex="0" role="button" aria-label="${escaped(t("page.overlay.corner", "{corner} of the area", { corner: NAMES[index] }))}"/>`,
     );

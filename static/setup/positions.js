@@ -1,6 +1,6 @@
 // The positions of a scene: thumbnails, and the present position on the stage and in numbers.
 
-import { escaped, placed, problems, things, thumbnail, windowOf, without } from "./bench.js";
+import { escaped, look, nameOf, placed, problems, things, thumbnail, windowOf, without } from "./bench.js";
 import { Generator } from "./generator.js";
 import { Stage } from "./stage.js";
 import { t } from "../site/sentences.js";
@@ -29,6 +29,8 @@ export class Positions {
     this.#may = may;
     this.#changed = changed;
     this.#overlay = overlay;
+    const kinds = Object.keys(bench.objects).map((key) => new Option(t("page.positions.simulated", "the simulated {name}", { name: nameOf(key, bench) }), key));
+    this.#part("add-kind")?.append(...kinds);
     this.#stage = new Stage(this.#part("stage"), bench, (laid) => this.#laid(laid));
     this.#part("thumbnails").addEventListener("click", (event) => this.#pressed(event));
     this.#part("position").addEventListener("input", (event) => this.#typed(event.target));
@@ -137,13 +139,13 @@ export class Positions {
     this.#part("no-things").hidden = all.length > 0;
   }
 
-  #row({ key, name, kind }) {
-    const has = { plate: 2, block: 3, object: 5 }[kind];
+  #row({ key, name, kind, round }) {
+    const has = kind === "object" ? 5 : round ? 2 : 3;
     const fields = NUMBERS.slice(0, has).map(
       ([field, words]) => `<label class="field small"><span class="label">${words}</span><input type="number" step="1" data-number="${field}" aria-label="${escaped(t("page.positions.number", "{name}: {words}", { name, words }))}"></label>`,
     );
     const away = this.#may ? `<button type="button" class="button button-quiet" data-take-away aria-label="${escaped(t("page.positions.take_away_one", "Take away {name}", { name }))}">${escaped(t("page.positions.take_away", "Take away"))}</button>` : "";
-    return `<li class="thing-row" data-thing-row="${escaped(key)}"><span class="row spread line"><span class="strong thing-key thing-key-${kind}">${escaped(name)}</span>${away}</span><span class="thing-numbers">${fields.join("")}</span></li>`;
+    return `<li class="thing-row" data-thing-row="${escaped(key)}"><span class="row spread line"><span class="strong thing-key thing-key-${look(kind, round)}">${escaped(name)}</span>${away}</span><span class="thing-numbers">${fields.join("")}</span></li>`;
   }
 
   #laid(bench) {
@@ -175,7 +177,7 @@ export class Positions {
     this.#part("add-thing").focus();
   }
 
-  /** Add an object: the simulated bench's block or plate, or one with a name. */
+  /** Add an object: one of the simulated bench, or one with a name. */
   #thing() {
     const kind = this.#part("add-kind").value;
     const name = this.#part("thing-name").value.trim();
@@ -185,10 +187,10 @@ export class Positions {
       return;
     }
     if (kind === "object" ? bench.objects?.[name] : bench[kind]) {
-      this.#tell(t("page.positions.there", "{name} is there already", { name: kind === "object" ? name : kind }));
+      this.#tell(t("page.positions.there", "{name} is there already", { name: kind === "object" ? name : nameOf(kind, this.#bench) }));
       return;
     }
-    const more = kind === "object" ? { objects: { ...bench.objects, [name]: OBJECT } } : { [kind]: this.#bench.first[kind] };
+    const more = kind === "object" ? { objects: { ...bench.objects, [name]: OBJECT } } : { [kind]: this.#bench.objects[kind].example };
     this.#part("thing-name").value = "";
     this.#laid({ ...bench, ...more });
     this.#draw();

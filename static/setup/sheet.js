@@ -60,8 +60,8 @@ function sheet(rows, [left, right, near, far], width, height) {
   return `<svg viewBox="${box(view)}" width="${width}mm" height="${height}mm" role="img" aria-label="${escaped(t("page.sheet.of", "Layout sheet of {title}", { title }))}">${lines.join("")}${laid.join("")}${head}</svg>`;
 }
 
-function tag({ name, kind, x, y, yaw }, number) {
-  const turn = kind === "plate" ? "" : ` ${n(yaw)}°`;
+function tag({ name, round, x, y, yaw }, number) {
+  const turn = round ? "" : ` ${n(yaw)}°`;
   return `<text class="tag" x="${n(x)}" y="${n(-y)}">${number}</text><text class="tag-small" x="${n(x)}" y="${n(-y + 5)}">${escaped(name)}${turn}</text>`;
 }
 

@@ -50,12 +50,12 @@ export class Stage {
   }
 
   #movable(thing) {
-    const { key, name, kind, depth } = thing;
+    const { key, name, round, depth } = thing;
     const label = whereabouts(thing);
     const named = `data-thing="${attribute(key)}"`;
     if (this.#still) return drawn(thing, { attributes: `${named} role="img" aria-label="${attribute(label)}"`, words: name });
     const far = -depth / 2 - HANDLE;
-    const handle = kind !== "plate" && key === this.#chosen ? `<path class="turn-line" d="M0 0V${n(far)}"/><circle class="turn" data-turn cy="${n(far)}" r="9"/>` : "";
+    const handle = !round && key === this.#chosen ? `<path class="turn-line" d="M0 0V${n(far)}"/><circle class="turn" data-turn cy="${n(far)}" r="9"/>` : "";
     const attributes = `${named} tabindex="0" role="button" aria-roledescription="${attribute(THING)}" aria-label="${attribute(label)}"`;
     return drawn(thing, { attributes, inside: handle, words: name });
   }

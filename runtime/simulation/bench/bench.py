@@ -7,11 +7,13 @@ table, where y is less than in the area for objects.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from runtime.benches.schema import load_schema
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64
 from runtime.simulation.bench.arm_frames import arm_frames
@@ -22,9 +24,22 @@ if TYPE_CHECKING:
 
 Colour = tuple[int, int, int]
 
+TABLETOP = load_schema("tabletop")
+_BLOCK, _PLATE = TABLETOP.box("block"), TABLETOP.disc("plate")
 _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
 _OVERHEAD_FOCAL = 1.0  # focal length in image widths
 _WRIST_FOCAL = 0.75
+
+
+def _colour(parts: Sequence[int]) -> Colour:
+    red, green, blue = parts
+    return red, green, blue
+
+
+_AREA = tuple(TABLETOP.area)
+_TABLE_COLOUR = _colour(TABLETOP.table_colour)
+_PLATE_COLOUR, _RIM_COLOUR = _colour(_PLATE.colour), _colour(_PLATE.rim_colour)
+_BLOCK_COLOURS = tuple(map(_colour, (_BLOCK.colour, *TABLETOP.distractors.colours)))
 
 
 class BenchError(RuntimeFault):
@@ -49,20 +64,20 @@ class Belt:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table.
+    """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table, by default the tabletop's.
 
     `area` bounds the places of objects: lowest x, highest x, lowest y, highest y. The first block belongs to the task
     and has the first of `block_colours`; the other blocks have the next colours in turn.
     """
 
-    block_edge: float = 0.04
-    plate_radius: float = 0.075
-    plate_height: float = 0.012
-    area: tuple[float, float, float, float] = (-0.22, 0.22, 0.18, 0.40)
-    table_colour: Colour = (176, 164, 146)
-    plate_colour: Colour = (226, 234, 244)
-    plate_rim_colour: Colour = (58, 104, 190)
-    block_colours: tuple[Colour, ...] = ((226, 74, 22), (40, 150, 70), (150, 70, 170), (235, 190, 40))
+    block_edge: float = _BLOCK.size[0]
+    plate_radius: float = _PLATE.radius
+    plate_height: float = _PLATE.height
+    area: tuple[float, ...] = _AREA
+    table_colour: Colour = _TABLE_COLOUR
+    plate_colour: Colour = _PLATE_COLOUR
+    plate_rim_colour: Colour = _RIM_COLOUR
+    block_colours: tuple[Colour, ...] = _BLOCK_COLOURS
     belt: Belt | None = None
 
 

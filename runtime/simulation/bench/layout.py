@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from runtime.simulation.bench.bench import Bench, BenchError, BenchLayout
+from runtime.simulation.bench.bench import TABLETOP, BenchError, BenchLayout
 
 NOISE_M = 0.005  # largest deviation from a requested place, in x and in y
 NOISE_RAD = math.radians(4.0)
-APART_M = 0.15  # least distance of block and plate, centre to centre
-_CROWD_M = 0.09  # least distance of two blocks, centre to centre
+APART_M = TABLETOP.distance("block", "plate")  # least distance, centre to centre
 _TRIES = 1000
-_SIDES = ((-0.25, 0.0), (0.25, 0.0))  # [m] places of arms; their reach for grasps from above follows
-_REACH = 0.42
 
 
 def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> BenchLayout:
@@ -43,37 +40,14 @@ def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: i
 
 def _parse_positions(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
     """Return the requested places of block (x, y, yaw in rad) and plate (x, y)."""
-    unknown = sorted(str(name) for name in positions if name not in ("block", "plate"))
-    if unknown:
-        raise BenchError(f"positions name {', '.join(unknown)}; allowed: block, plate")
-    block = _place("block", positions.get("block"), 3)
-    plate = _place("plate", positions.get("plate"), 2)
+    given = {name: place for name, place in positions.items() if place is not None}
+    if problem := next(TABLETOP.problems(given), ""):
+        raise BenchError(f"positions: {problem}")
+    placed = {name: [float(number) for number in place] for name, place in given.items()}
+    block, plate = placed.get("block"), placed.get("plate")
     if block is not None:
         block[2] = math.radians(block[2])
-    if block is not None and plate is not None and math.dist(block[:2], plate) < APART_M:
-        raise BenchError(
-            f"block and plate are {math.dist(block[:2], plate):.3f} m apart; allowed: {APART_M} m or more"
-        )
     return block, plate
-
-
-def _place(name: str, value: Any, count: int) -> list[float] | None:
-    if value is None:
-        return None
-    numbers = list(value) if isinstance(value, list | tuple) else []
-    right = len(numbers) == count and all(
-        isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
-        for number in numbers
-    )
-    if not right:
-        raise BenchError(f"positions.{name} = {value!r}; allowed: {count} finite numbers")
-    x_from, x_to, y_from, y_to = Bench().area
-    x, y = numbers[:2]
-    if not (x_from <= x <= x_to and y_from <= y <= y_to):
-        raise BenchError(
-            f"positions.{name} = {value!r}; allowed: x {x_from} to {x_to} m, y {y_from} to {y_to} m"
-        )
-    return [float(number) for number in numbers]
 
 
 def _pair(
@@ -94,11 +68,12 @@ def _pair(
 
 
 def _one_side(*places: tuple[float, float]) -> bool:
-    return any(all(math.dist(side, place) <= _REACH for place in places) for side in _SIDES)
+    reach = TABLETOP.reach
+    return any(all(math.dist(side, place) <= reach.distance for place in places) for side in reach.sides)
 
 
 def _random_place(chance: np.random.Generator) -> tuple[float, float, float]:
-    x_from, x_to, y_from, y_to = Bench().area
+    x_from, x_to, y_from, y_to = TABLETOP.area
     x, y = chance.uniform((x_from, y_from), (x_to, y_to))
     return float(x), float(y), float(chance.uniform(-math.pi / 4, math.pi / 4))
 
@@ -112,9 +87,10 @@ def _random_near(chance: np.random.Generator, place: list[float]) -> tuple[float
 def _distractor(
     chance: np.random.Generator, placed: list[tuple[float, float, float]], plate: tuple[float, float]
 ) -> tuple[float, float, float]:
+    crowd = TABLETOP.distractors.distance
     for _ in range(_TRIES):
         x, y, yaw = _random_place(chance)
-        clear = all(math.dist((x, y), taken_place[:2]) >= _CROWD_M for taken_place in placed)
+        clear = all(math.dist((x, y), taken_place[:2]) >= crowd for taken_place in placed)
         if clear and math.dist((x, y), plate) >= APART_M:
             return x, y, yaw
     raise BenchError(f"no place was found for block {len(placed) + 1}; allowed: fewer blocks")

@@ -58,7 +58,7 @@ def test_what_lies_there_is_in_millimetres_and_is_put_elsewhere() -> None:
 def test_keys_move_and_turn_what_lies_there(pressed: dict[str, Any], change: dict[str, float] | None) -> None:
     _, block = call(BENCH, "things", LAID, SIZES)
     assert call(BENCH, "stepped", block, pressed) == change
-    plate = {**block, "kind": "plate"}
+    plate = {**block, "round": True}
     assert call(BENCH, "stepped", plate, {"key": "PageUp"}) is None
 
 
@@ -72,10 +72,10 @@ def test_what_is_moved_stays_in_the_area_but_things_of_ones_own() -> None:
 
 
 def test_corners_of_what_is_turned_are_where_they_are_seen() -> None:
-    thing = {"kind": "object", "x": 100, "y": 200, "yaw": 90, "width": 40, "depth": 20}
+    thing = {"round": False, "x": 100, "y": 200, "yaw": 90, "width": 40, "depth": 20}
     corners = call(BENCH, "outline", thing)
     assert sorted([round(x), round(y)] for x, y in corners) == [[90, 180], [90, 220], [110, 180], [110, 220]]
-    assert len(call(BENCH, "outline", {**thing, "kind": "plate"})) == 32
+    assert len(call(BENCH, "outline", {**thing, "round": True})) == 32
 
 
 def test_a_position_in_words_alone_shows_its_reference_picture_if_there_is_one() -> None:

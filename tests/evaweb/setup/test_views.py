@@ -11,10 +11,10 @@ from django.test import Client
 from django.urls import reverse
 
 from evaweb.plans.models import Reference
-from evaweb.setup.editing import OVERHEAD, SIZES
+from evaweb.setup.editing import OVERHEAD
 from evaweb.stations.models import Station
 from evaweb.trials.models import FailureTerm, Scene
-from runtime.simulation.bench import layout
+from evaweb.trials.tables import EXAMPLE
 from runtime.simulation.bench.bench import Bench, overhead_camera
 from tests.evaweb.trials import builders
 
@@ -40,15 +40,6 @@ def to(client, alma):
 def state(client: Client, user: Any, address: str) -> Any:
     client.force_login(user)
     return client.get(address).context["state"]
-
-
-def test_the_sizes_that_are_drawn_are_those_of_the_simulated_bench():
-    assert SIZES["area"] == list(Bench().area)
-    assert (SIZES["block"], SIZES["plate"]) == (Bench().block_edge, Bench().plate_radius)
-    assert SIZES["apart"] == layout.APART_M
-    assert [tuple(side) for side in SIZES["sides"]] == list(layout._SIDES)
-    assert SIZES["reach"] == layout._REACH
-    assert layout.draw_layout(1, SIZES["first"]).plate
 
 
 def test_the_corners_are_where_the_camera_from_above_sees_them():
@@ -87,7 +78,7 @@ def test_a_new_scene_of_a_lab_with_a_simulated_bench_has_its_block_and_plate(cli
     live.simulated = True
     live.save()
     given = state(client, alma, reverse("setup-new-scene"))
-    assert given["scene"]["positions"][0]["bench"] == SIZES["first"]
+    assert given["scene"]["positions"][0]["bench"] == EXAMPLE
     assert given["stations"][0]["corners"]["cam_high"] == OVERHEAD
 
 

@@ -7,23 +7,8 @@ import pytest
 
 import robots
 from evaweb.stations.robot_geometry import drawn_robot
-from evaweb.stations.surroundings import AREA, BENCH, bounds, scene_surroundings
+from evaweb.stations.surroundings import AREA, bounds, scene_surroundings
 from robots.visuals import Visual
-from runtime.simulation.bench.bench import Bench
-
-
-def test_the_bench_that_is_drawn_is_the_one_that_is_simulated():
-    bench = Bench()
-    for size in ("block_edge", "plate_radius", "plate_height"):
-        assert BENCH[size] == getattr(bench, size)
-    assert BENCH["area"] == list(bench.area)
-    for drawn, painted in (
-        (BENCH["plate_colour"], bench.plate_colour),
-        (BENCH["plate_rim_colour"], bench.plate_rim_colour),
-        (scene_surroundings(drawn_robot("agilex_piper"))["table"]["colour"], bench.table_colour),
-        *zip(BENCH["block_colours"], bench.block_colours, strict=True),
-    ):
-        assert drawn[:3] == pytest.approx([part / 255 for part in painted])
 
 
 def rectangle(table):

@@ -82,7 +82,7 @@ def test_an_admin_adds_a_scene_with_its_positions_and_milestones(admin):
     [
         ({"positions-TOTAL_FORMS": "0"}, "at least 1"),
         ({"positions-0-bench": "{block: 1}"}, "The table: is not valid JSON"),
-        ({"positions-0-bench": '{"cup": [0, 0]}'}, "cup: unknown key; allowed: block, plate"),
+        ({"positions-0-bench": '{"cup": [0, 0]}'}, "cup: unknown key; allowed: plate, block"),
         ({"time_limit_s": "0"}, "greater than or equal to 1"),
         ({"milestones-0-points": "0"}, "greater than or equal to 1"),
         (

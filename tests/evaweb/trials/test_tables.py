@@ -91,7 +91,7 @@ def test_benches_that_can_be_pass(bench):
     ("bench", "sentence"),
     [
         ([1], "allowed: a table such as"),
-        ({"cup": [0, 0]}, "cup: unknown key; allowed: block, plate"),
+        ({"cup": [0, 0]}, "cup: unknown key; allowed: plate, block, objects"),
         ({"block": [0, 0]}, "block = [0, 0]; allowed: 3 numbers: [x, y, yaw in degrees]"),
         ({"plate": [0, "a"]}, "allowed: 2 numbers"),
         ({"plate": [0, True]}, "allowed: 2 numbers"),

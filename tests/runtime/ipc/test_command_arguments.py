@@ -9,7 +9,6 @@ from runtime.ipc.command_arguments import (
     BenchRequest,
     Checkpoint,
     Nothing,
-    Positions,
     RunRequest,
     SetUpRequest,
     read,
@@ -24,18 +23,19 @@ REFUSED = {
     ),
     "an unknown key of a table": (
         SetUpRequest,
-        {"bench": {"seed": 1, "positions": {"blok": [1.0]}}},
-        "say: bench.positions.blok = [1.0]: unknown key (did you mean block?); allowed here: block, plate",
+        {"bench": {"seed": 1, "positons": {"block": [0.0, 0.3, 0.0]}}},
+        "say: bench.positons = {'block': [0.0, 0.3, 0.0]}: unknown key (did you mean positions?); "
+        "allowed here: id, positions, seed",
     ),
     "no table": (SetUpRequest, {"policy": "openpi"}, "say: policy = 'openpi': must be a table"),
     "no seed": (SetUpRequest, {"bench": {}}, "say: bench.seed is missing"),
     "a seed below zero": (SetUpRequest, {"bench": {"seed": -1}}, "say: bench.seed = -1: "),
     "a seed that a browser cannot count": (SetUpRequest, {"bench": {"seed": 2**53}}, "say: bench.seed = "),
     "a seed that is a truth": (SetUpRequest, {"bench": {"seed": True}}, "say: bench.seed = True: "),
-    "a place of two numbers": (
+    "a place of one number": (
         SetUpRequest,
-        {"bench": {"seed": 1, "positions": {"block": [1, 2]}}},
-        "say: bench.positions.block = [1, 2]: List should have at least 3 items",
+        {"bench": {"seed": 1, "positions": {"block": [1]}}},
+        "say: bench.positions.block = [1]: List should have at least 2 items",
     ),
     "a place that is nowhere": (
         SetUpRequest,
@@ -90,7 +90,7 @@ def test_only_policy_and_task_change_the_deployment():
     )
     assert asked.changes == {"policy": {"url": "ws://127.0.0.1:9"}, "task": ""}
     assert asked.checkpoint == Checkpoint(id=3, name="A")
-    assert asked.bench == BenchRequest(id="r", seed=2, positions=Positions(block=[0.0, 0.3, 45.0]))
+    assert asked.bench == BenchRequest(id="r", seed=2, positions={"block": [0.0, 0.3, 45.0]})
 
 
 def test_what_is_none_is_absent():

@@ -74,7 +74,9 @@ class PolicyResponse:
     """Result of a completed inference: chunk, duration [s], observation, and joint commands.
 
     `seconds` is the latency on the station's clock: in lockstep the declared one, while `wall_seconds` is measured on
-    the machine's clock everywhere. `commands` are the rows of `chunk`, converted to joint commands. If a row was refused, they end before it, and
+    the machine's clock everywhere.
+
+    `commands` are the rows of `chunk`, converted to joint commands. If a row was refused, they end before it, and
     `refused` is the reason, else "". If `requested_while_stopped`, the robot was at rest until the response. `eef` is
     the origin of the observation's poses: "measured" by the robot, or "fk" from its joints.
     """
@@ -240,9 +242,7 @@ class PolicyRequests:
             commands, refused = (
                 self._within(commands, onset.first_row, fresh or holding) if executed else (commands, "")
             )
-            return PolicyResponse(
-                chunk, seconds, completed, commands, waited, age, source, ik, refused, wall
-            )
+            return PolicyResponse(chunk, seconds, completed, commands, waited, age, source, ik, refused, wall)
 
         return self.runner.submit(infer)
 

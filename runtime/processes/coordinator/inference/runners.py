@@ -115,9 +115,9 @@ class DeclaredRunner(Runner):
     """Runner that executes calls between two ticks; a call's result is ready after a declared number of ticks.
 
     The function `declared` receives what a call returned. It returns the result of the call, and the number of ticks
-    after which that result is ready, at least one. Calls start at `start_waiting`. They run on a thread, so that the ticking thread
-    can answer commands meanwhile; no tick may pass while a call is running. Therefore the step at which a result is
-    ready does not depend on the call's real duration.
+    after which that result is ready, at least one. Calls start at `start_waiting`. They run on a thread, so that the
+    ticking thread can answer commands meanwhile; no tick may pass while a call is running. Therefore the step at which
+    a result is ready does not depend on the call's real duration.
     """
 
     def __init__(self, declared: Declared) -> None:

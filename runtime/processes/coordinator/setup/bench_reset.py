@@ -6,6 +6,7 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
+from runtime.benches.schema import load_schema
 from runtime.core.clock import Clock
 from runtime.core.errors import SetupError
 from runtime.core.sentences import Pattern, fixed
@@ -24,6 +25,7 @@ _RESET_ALREADY = Pattern(
     "setup: bench.id = {identity!r}: the bench was reset under this id already; allowed: an id of its "
     "own for each reset, or none",
 )
+_NO_LAYOUT = Pattern("bench.no_layout", "setup: bench.positions: {why}")
 _CANNOT_RESET = Pattern("bench.cannot_reset", "the bench cannot be reset: {why}")
 _NOT_RESET = Pattern("bench.not_reset", "the bench was not reset within {seconds:g} s: {why}")
 _NODE_REFUSED = Pattern("bench.node_refused", "the robot refused it ({reasons})")
@@ -50,12 +52,15 @@ class BenchReset:
         """Return the reset to send to the node; None if `bench` is None.
 
         Raises:
-            SetupError: the transport simulates no bench, or a reset with this id was done already.
+            SetupError: the transport simulates no bench, its bench does not accept the layout, or a reset with this id
+                was done already.
         """
         if bench is None:
             return None
         if not self._plan.capabilities.resets_bench:
             raise SetupError(_NOT_SIMULATED(seed=bench.seed))
+        if problem := next(load_schema("tabletop").problems(bench.positions or {}), ""):
+            raise SetupError(_NO_LAYOUT(why=problem))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
             raise SetupError(_RESET_ALREADY(identity=bench.id))
         return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}

@@ -54,14 +54,14 @@ def test_layouts_differ_by_seed_with_and_without_positions() -> None:
 @pytest.mark.parametrize(
     ("positions", "says"),
     [
-        ({"bowl": [0.0, 0.3]}, "bowl; allowed: block, plate"),
+        ({"bowl": [0.0, 0.3]}, "bowl: unknown object; allowed: plate, block"),
         ({"block": [0.0, 0.3]}, "allowed: 3 finite numbers"),
         ({"block": "here"}, "allowed: 3 finite numbers"),
         ({"plate": [0.0, math.nan]}, "allowed: 2 finite numbers"),
         ({"plate": [0.0, True]}, "allowed: 2 finite numbers"),
-        ({"plate": [0.5, 0.3]}, "x -0.22 to 0.22 m"),
-        ({"block": [0.0, 0.3, 0.0], "plate": [0.1, 0.3]}, "0.100 m apart; allowed: 0.15 m or more"),
-        ({"block": [0.0, 0.3, 0.0], 3: [0.1, 0.3]}, "name 3"),
+        ({"plate": [0.5, 0.3]}, "allowed on a simulated bench: x -220 to 220, y 180 to 400 mm"),
+        ({"block": [0.0, 0.3, 0.0], "plate": [0.1, 0.3]}, "100 mm apart; allowed: 150 mm or more"),
+        ({"block": [0.0, 0.3, 0.0], 3: [0.1, 0.3]}, "3: unknown object"),
     ],
 )
 def test_positions_that_cannot_be_are_refused_with_a_sentence(positions: dict, says: str) -> None:

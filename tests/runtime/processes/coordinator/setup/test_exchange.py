@@ -309,6 +309,15 @@ def test_the_id_of_the_last_reset_is_refused_because_it_would_change_nothing(tmp
     station.close()
 
 
+def test_a_layout_that_the_bench_does_not_accept_is_refused_before_anything_is_asked(tmp_path: Path) -> None:
+    station = simulated(tmp_path).ready(bench=BENCH)
+    told = len(station.robot.told)
+    with pytest.raises(SetupError, match=r"bench\.positions: cup: unknown object; allowed: plate, block"):
+        station.command("setup", bench={"seed": 1, "positions": {"cup": [0.0, 0.3]}})
+    assert len(station.robot.told) == told
+    station.close()
+
+
 def test_a_bench_that_is_not_reset_in_time_ends_the_set_up(tmp_path: Path) -> None:
     station = simulated(tmp_path)
     station.robot.deaf = 1000

@@ -1,0 +1,212 @@
+"""Schema of a simulated bench: its objects and what a layout may ask for, read from the bench's folder."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from runtime.core.errors import SetupError
+from runtime.core.settings import Settings, explain_validation_error
+
+FOLDER = Path(__file__).parent
+FILE = "bench.toml"
+
+Part = Annotated[int, Field(ge=0, le=255)]
+Colour = Annotated[list[Part], Field(min_length=3, max_length=3)]
+Length = Annotated[float, Field(gt=0, le=2)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+_NUMBERS = ("x", "y", "yaw in degrees")
+
+
+class _Placed(Settings):
+    title: Annotated[str, Field(min_length=1, max_length=40)]
+    """What people call it."""
+    colour: Colour
+    example: Annotated[list[float], Field(min_length=2, max_length=3)]
+    """Place in a new position: the numbers of `numbers`."""
+
+
+class Box(_Placed):
+    """Box that stands on the table."""
+
+    shape: Literal["box"]
+    size: Annotated[list[Length], Field(min_length=3, max_length=3)]
+    """Edges along x, y and z at yaw 0 [m]."""
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the numbers of a place: x, y [m] and yaw [degrees]."""
+        return _NUMBERS
+
+
+class Disc(_Placed):
+    """Flat disc that lies on the table."""
+
+    shape: Literal["disc"]
+    radius: Length
+    height: Length
+    rim_colour: Colour
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the numbers of a place: x, y [m]; a disc has no yaw."""
+        return _NUMBERS[:2]
+
+
+class Apart(Settings):
+    """Least distance of two objects, centre to centre [m]."""
+
+    objects: Annotated[list[Name], Field(min_length=2, max_length=2)]
+    distance: Length
+
+
+class Reach(Settings):
+    """Places of arms, and the largest horizontal distance at which they grasp from above [m]."""
+
+    sides: Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=1)]
+    distance: Length
+
+
+class Distractors(Settings):
+    """Further objects like the first box, placed at random: their colours, and their least distance from boxes [m]."""
+
+    colours: list[Colour] = Field(default_factory=list)
+    distance: Length = 0.1
+
+
+class BenchSchema(Settings):
+    """What a bench consists of, and which layouts it accepts."""
+
+    title: Annotated[str, Field(min_length=1, max_length=80)]
+    instruction: str
+    area: Annotated[list[float], Field(min_length=4, max_length=4)]
+    table_colour: Colour
+    reach: Reach
+    objects: Annotated[dict[Name, Annotated[Box | Disc, Field(discriminator="shape")]], Field(min_length=1)]
+    apart: list[Apart] = Field(default_factory=list)
+    distractors: Distractors = Distractors()
+    milestones: dict[Name, str]
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> BenchSchema:
+        x_from, x_to, y_from, y_to = self.area
+        if not (x_from < x_to and y_from < y_to):
+            raise SetupError(
+                f"area = {self.area}; allowed: x from, x to, y from, y to, each range increasing"
+            )
+        if "objects" in self.objects:
+            raise SetupError(
+                "objects.objects: this name is that of objects laid out by people; allowed: another"
+            )
+        for pair in self.apart:
+            strangers = [name for name in pair.objects if name not in self.objects]
+            if strangers or pair.objects[0] == pair.objects[1]:
+                raise SetupError(f"apart.objects = {pair.objects}; allowed: two of {', '.join(self.objects)}")
+        if problem := next(self.problems({name: thing.example for name, thing in self.objects.items()}), ""):
+            raise SetupError(f"the examples are no layout: {problem}")
+        return self
+
+    def box(self, name: str) -> Box:
+        """Return the box of that name. Raises: SetupError if there is none."""
+        thing = self.objects.get(name)
+        if not isinstance(thing, Box):
+            raise SetupError(f"the bench {self.title!r} has no box {name!r}")
+        return thing
+
+    def disc(self, name: str) -> Disc:
+        """Return the disc of that name. Raises: SetupError if there is none."""
+        thing = self.objects.get(name)
+        if not isinstance(thing, Disc):
+            raise SetupError(f"the bench {self.title!r} has no disc {name!r}")
+        return thing
+
+    def distance(self, one: str, other: str) -> float:
+        """Return the least distance of two objects [m], 0 if none is declared."""
+        return next((pair.distance for pair in self.apart if {one, other} == set(pair.objects)), 0.0)
+
+    def problems(self, layout: Mapping[str, Any]) -> Iterator[str]:
+        """Yield a sentence for each place of `layout` (name -> numbers) that the bench does not accept.
+
+        A layout may leave objects out; they are then placed at random.
+        """
+        placed = {}
+        for name, place in layout.items():
+            problem = self._place_problem(name, place)
+            if problem:
+                yield problem
+            else:
+                placed[name] = place
+        for pair in self.apart:
+            one, other = pair.objects
+            if one in placed and other in placed:
+                apart = math.dist(placed[one][:2], placed[other][:2])
+                if apart < pair.distance:
+                    yield (
+                        f"{one} and {other} are {1000 * apart:.0f} mm apart; allowed: "
+                        f"{1000 * pair.distance:.0f} mm or more"
+                    )
+
+    def _place_problem(self, name: str, place: Any) -> str:
+        thing = self.objects.get(name)
+        if thing is None:
+            return f"{name}: unknown object; allowed: {', '.join(self.objects)}"
+        if not is_place(place, len(thing.numbers)):
+            parts = ", ".join(thing.numbers)
+            return (
+                f"{name} = {place!r:.80}; allowed: {len(thing.numbers)} finite numbers: [{parts}], in metres"
+            )
+        x_from, x_to, y_from, y_to = self.area
+        x, y = place[:2]
+        if x_from <= x <= x_to and y_from <= y <= y_to:
+            return ""
+        return (
+            f"{name} at x {1000 * x:.0f}, y {1000 * y:.0f} mm; allowed on a simulated bench: "
+            f"x {1000 * x_from:.0f} to {1000 * x_to:.0f}, y {1000 * y_from:.0f} to {1000 * y_to:.0f} mm"
+        )
+
+
+def is_place(value: Any, count: int) -> bool:
+    """Return True for a list or tuple of `count` finite numbers."""
+    return (
+        isinstance(value, list | tuple)
+        and len(value) == count
+        and all(
+            isinstance(part, int | float) and not isinstance(part, bool) and math.isfinite(part)
+            for part in value
+        )
+    )
+
+
+def installed_benches() -> list[str]:
+    """Return the names of the benches that come with the program, sorted."""
+    return sorted(file.parent.name for file in FOLDER.glob(f"*/{FILE}"))
+
+
+@cache  # cache: a bench stays the same while this runs; an integrator who edits it starts the station anew
+def load_schema(bench: str) -> BenchSchema:
+    """Return the schema of a bench: the name of one that comes with the program, or the path of its folder.
+
+    Raises:
+        SetupError: If there is none, or its file is invalid.
+    """
+    folder = FOLDER / bench if bench in installed_benches() else Path(bench).expanduser()
+    file = folder / FILE
+    try:
+        tree = tomllib.loads(file.read_text(encoding="utf-8"))
+        return BenchSchema.model_validate(tree)
+    except FileNotFoundError:
+        raise SetupError(
+            f"bench {bench!r} has no {FILE}; allowed: {', '.join(installed_benches())}, or the path of a bench's folder"
+        ) from None
+    except SetupError as error:
+        raise SetupError(f"{file}: {error}") from error
+    except ValidationError as invalid:
+        raise SetupError(explain_validation_error(invalid, BenchSchema, tree, str(file))) from invalid
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SetupError(f"{file}: {error}") from error
