@@ -1,9 +1,11 @@
 """Bench with contact forces against the bench without: success of the scripted policy, and cost of the physics.
 
-For every known robot, the scripted pick-and-place policy does its task in joints on both benches, one trial per seed.
+For every known robot, the scripted pick-and-place policy does its task in joints on both benches, one trial per seed,
+and with three robots on the bench with contact forces also in poses.
 Node, bench, policy server and station are the product's own, in lockstep on a virtual clock.
 
 * `success.BENCH.ROBOT`: number of trials that end with the block at rest on the plate, within 40 s.
+* `success_in_poses.ROBOT`: the same number with actions in poses, with contact forces.
 * `tick_ms.BENCH.ROBOT`: median processor time of the robot and the bench for a tick of the control rate, without
   images. Ticks of trials are measured: the arm moves, and the block is held for about half of the time.
 * `tick_ratio.ROBOT`: quotient of the sums over all ticks, with contact forces over without.
@@ -13,7 +15,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -35,6 +37,11 @@ DEPLOYMENTS = {  # robot -> deployment with actions in joints
     "ur5e": "tabletop_ur5e",
     "agibot_g2": "tabletop_agibot_g2",
 }
+IN_POSES = {  # robot -> deployment, and settings that make its actions poses
+    "agilex_piper": ("tabletop_agilex_piper_eef", ()),
+    "ur5e": ("tabletop_ur5e_eef", ()),
+    "dual_franka": ("tabletop_dual_franka", ('policy.action_space="eef"',)),
+}
 SEEDS = 20
 
 
@@ -54,14 +61,18 @@ def measure(seconds: float) -> Report:
             figures.append(Figure(f"tick_ms.{bench}.{robot}", 1e3 * float(np.median(times)), "ms"))
         ratio = float(np.sum(spent["contact"]) / np.sum(spent["tabletop"]))
         figures.append(Figure(f"tick_ratio.{robot}", ratio, ""))
+    for robot, (deployment, assignments) in IN_POSES.items():
+        successes = [_try(deployment, seed, "contact", [], assignments) for seed in range(SEEDS)]
+        figures.append(Figure(f"success_in_poses.{robot}", sum(successes), "", f">= {0.9 * SEEDS:g}"))
     return Report("contact", figures, rows)
 
 
-def _try(deployment: str, seed: int, bench: str, times: list[float]) -> bool:
+def _try(deployment: str, seed: int, bench: str, times: list[float], assignments: Sequence[str] = ()) -> bool:
     """Return whether a trial succeeded; append the processor time of each tick [s] to `times`."""
     kind: Callable[[Robot, int], BlockTable] = ContactTabletop if bench == "contact" else Tabletop
     with tempfile.TemporaryDirectory() as data:
-        return pick_and_place(deployment, seed, Path(data), make=partial(_timed, kind, times)).success
+        timed = partial(_timed, kind, times)
+        return pick_and_place(deployment, seed, Path(data), assignments, make=timed).success
 
 
 def _timed(

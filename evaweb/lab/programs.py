@@ -80,7 +80,7 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
         ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
-        return ("-m", "runtime.simulation.node", "--robot", robot, "--bench", "tabletop", *options, *ends)
+        return ("-m", "runtime.simulation.node", "--robot", robot, "--bench", "contact", *options, *ends)
 
     free = "tcp://127.0.0.1:0"
     return ProgramSpec(

@@ -93,7 +93,7 @@ def station(
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
     spec = check_deployment(loader.load(path, assignments))
-    arguments = ("--robot", spec.robot.name, "--bench", "tabletop", *bench_options)  # the last --bench counts
+    arguments = ("--robot", spec.robot.name, "--bench", "contact", *bench_options)  # the last --bench counts
     options = node_parser().parse_args(arguments)
     around = environments.make_environment(spec.robot, options)
     peers = in_process_peers(spec, clock, around, options)
@@ -111,9 +111,9 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument("--seed", type=int, default=0, help="the first layout of the bench")
     line.add_argument(
         "--bench",
-        choices=("tabletop", "contact"),
-        default="tabletop",
-        help="how blocks move: by rules, or by contact forces (default: tabletop)",
+        choices=("contact", "tabletop"),
+        default="contact",
+        help="how blocks move: by contact forces, or by rules (default: contact)",
     )
     line.add_argument(
         "--serve",

@@ -10,6 +10,7 @@ machines of one kind.
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ from runtime.simulation.contact.physics import PLANT_STEP, STEP, Physics
 if TYPE_CHECKING:
     from robots import Robot
 
+log = logging.getLogger(__name__)
 _SUBSTEPS = round(PLANT_STEP / STEP)
 _LONGEST_NOTE = 1 / 30  # [s] longest time between two updates of milestones
 # Solvers leave motions of nanometres. Changes below these bounds are not shown, so that images need not be drawn again.
@@ -80,10 +82,13 @@ class ContactTabletop(BlockTable):
 
     def _place_objects(self, wish: ResetRequest) -> None:
         super()._place_objects(wish)
-        joints, data = self._joints, self._data
-        robot = data.qpos[joints.positions].copy()
+        self._put_everything(self._data.qpos[self._joints.positions].copy())
+
+    def _put_everything(self, values: Float64) -> None:
+        """Put the robot's joints at `values` [n] and the objects where they were seen last; all of it at rest."""
+        data = self._data
         self._mujoco.mj_resetData(self._model, data)
-        data.qpos[joints.positions] = robot
+        data.qpos[self._joints.positions] = values
         data.mocap_pos[self._built.plate] = *self._plate, 0.0
         for block, start in zip(self._blocks, self._built.blocks, strict=True):
             data.qpos[start : start + 3] = block.pose[:3, 3]
@@ -130,9 +135,14 @@ class ContactTabletop(BlockTable):
         self._speed = speed
         step = seconds / _SUBSTEPS
         self._model.opt.timestep = step
+        before, began = data.qpos[joints.positions].copy(), data.time
         for index in range(_SUBSTEPS):
             data.ctrl[joints.actuators] = start + (index * step + joints.lead_times) * speed
             self._mujoco.mj_step(self._model, data)
+            if data.time < began + (index + 0.5) * step:  # MuJoCo has reset itself: numbers had run away
+                log.warning("the physics diverged: robot and blocks are put back, at rest")
+                self._put_everything(before)
+                return
 
     def _read_joints(self) -> Float64:
         """Return the measured joints [D]; numbers that move no link are at their references."""

@@ -223,6 +223,14 @@ def test_so_it_does_with_every_robot(name, tmp_path):
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("name", ["tabletop_agilex_piper_eef", "tabletop_ur5e_eef", "tabletop_dual_franka"])
+def test_so_it_does_in_poses(name, tmp_path):
+    trial = pick_and_place(name, 2, tmp_path, ['policy.action_space="eef"'], make=ContactTabletop)
+    assert trial.success, trial.events
+    assert trial.milestones == EVERY_MILESTONE
+
+
+@pytest.mark.exhaustive
 @settings(max_examples=some(10))
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_whatever_is_commanded_blocks_are_numbers_and_not_below_the_table(seed, blocks):
@@ -235,6 +243,19 @@ def test_whatever_is_commanded_blocks_are_numbers_and_not_below_the_table(seed, 
         for state in hands.table.state().blocks:
             assert np.isfinite(state.pose).all()
             assert state.pose[2, 3] > 0
+
+
+def test_numbers_that_run_away_move_neither_robot_nor_blocks(caplog):
+    hands = operator()
+    hands.commands(READY, 1.0)
+    joints, blocks = hands.plant.q.copy(), hands.table.truth()["blocks"]
+    hands.table._data.qvel[:] = np.nan
+    hands.commands(READY, 0.1)
+    assert "the physics diverged" in caplog.text
+    np.testing.assert_allclose(hands.plant.q, joints, atol=1e-3)
+    np.testing.assert_allclose(hands.table.truth()["blocks"], blocks, atol=1e-3)
+    hands.closes_on_block()
+    assert hands.truth["held"] == ["left_arm"]
 
 
 @pytest.mark.parametrize("seconds", [0.001, 1 / 30, 0.2])
