@@ -111,8 +111,9 @@ def episodes(
     url_name="dataset-jobs",
 )
 def ask(request: HttpRequest, given: dataset_orders.Order) -> Any:
-    """Queue a check, repair, conversion, merge or split; only administrators may delete and push.
+    """Queue a check, repair, conversion, import, merge, split or export as MCAP.
 
-    The job reports the progress.
+    Only administrators may delete, push and pull. The job reports the progress. MCAP files are then downloaded
+    episode by episode, for a day.
     """
     return Status(202, dataset_orders.submit_order(user=request.auth, given=given.model_dump()))

@@ -25,6 +25,8 @@ _VERBS = {
     "split": "Split",
     "delete": "Delete",
     "push": "Push",
+    "pull": "Pull",
+    "mcap": "Export as MCAP",
 }
 
 
@@ -83,7 +85,7 @@ def summarize_job(job: Job) -> JobSummary:
 
 def _about(args: Mapping[str, Any]) -> str:
     sources = [name.removeprefix("datasets/") for name in args.get("datasets") or [args.get("dataset", "")]]
-    about = ", ".join(sources)
+    about = args["repository"] if args["what"] == "pull" else ", ".join(sources)
     if args.get("to"):
         return f"{about} to {args['to'].removeprefix('datasets/')}"
     if args["what"] == "delete":
@@ -100,11 +102,14 @@ def _sentence(action: str, result: Mapping[str, Any]) -> str:
     if action == "import":
         text = f"{_counted(result['episodes'], 'episode')} can be reviewed, {result['made']} new"
         return text + (f"; {problems[0]}" if problems else "")
+    if action == "mcap":
+        text = f"{result['files']} of {_counted(result['episodes'], 'episode')} as MCAP, for a day"
+        return text + (f"; {_counted(len(problems), 'problem')}: {problems[0]}" if problems else "")
     parts = result.get("parts") or [result]
     episodes, rows = (sum(part[name] for part in parts) for name in ("episodes", "frames"))
     text = f"{_counted(episodes, 'episode')}, {_counted(rows, 'row')}"
-    encoded = sum(len(part["encoded"]) for part in parts)
-    left = [thing for part in parts for thing in part["left_out"]]
+    encoded = sum(len(part.get("encoded", ())) for part in parts)
+    left = [thing for part in parts for thing in part.get("left_out", ())]
     text += f"; {_counted(encoded, 'video')} coded again" if encoded else ""
     text += f"; left out: {'; '.join(left)}" if left else ""
     return text + (f"; {problems[0]}" if problems else "")

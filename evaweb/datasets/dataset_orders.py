@@ -16,8 +16,10 @@ from evaweb.datasets.overview import dataset_names, folder_named, get_dataset_fo
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.core.sentences import Pattern
+from runtime.datasets.card import Licence
 from runtime.datasets.layout import INFO
 from runtime.datasets.operations import fingerprint
+from runtime.interop.mcap_export import Pictures
 from runtime.recording.files import RecordingError
 
 _ROBOT_ALLOWED_NONE = Pattern(
@@ -121,13 +123,30 @@ class Push(_Order):
     dataset: Name
     repository: Name
     private: StrictBool = True
+    licence: Licence = ""
 
 
-Order = Annotated[
-    Check | Repair | Convert | Import | Merge | Split | Delete | Push, Field(discriminator="what")
-]
-_ADAPTER: TypeAdapter[Check | Repair | Convert | Import | Merge | Split | Delete | Push] = TypeAdapter(Order)
-_OF_ADMINS = ("delete", "push")
+class Pull(_Order):
+    """Order to download a dataset from the Hugging Face hub as a new one. Requires an administrator."""
+
+    what: Literal["pull"]
+    repository: Name
+    to: Name
+    revision: Annotated[str, Field(max_length=200)] = ""
+
+
+class Mcap(_Order):
+    """Order to write every episode of a dataset that was recorded here as one MCAP file, which is kept for a day."""
+
+    what: Literal["mcap"]
+    dataset: Name
+    pictures: Pictures = "video"
+
+
+AnyOrder = Check | Repair | Convert | Import | Merge | Split | Delete | Push | Pull | Mcap
+Order = Annotated[AnyOrder, Field(discriminator="what")]
+_ADAPTER: TypeAdapter[AnyOrder] = TypeAdapter(Order)
+_OF_ADMINS = ("delete", "push", "pull")
 
 
 def least_for(what: str) -> Role:
@@ -159,23 +178,30 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
     """
     order = parse_order(given)
     require_role(user, least_for(order.what))
-    sources = list(order.datasets) if isinstance(order, Merge) else [order.dataset]
+    sources = _sources(order)
     names = [full_name(name) for name in sources]
     for name in names:
         get_dataset_folder(name)
     args = order.model_dump()
     if isinstance(order, Merge):
         args["datasets"] = names
-    else:
+    elif names:
         args["dataset"] = names[0]
-    if isinstance(order, Convert | Merge | Split):
+    if isinstance(order, Convert | Merge | Split | Pull):
         args["to"] = _new(order.to, order.parts if isinstance(order, Split) else ())
     if isinstance(order, Delete):
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
     if isinstance(order, Import) and order.robot and order.robot not in robots.robot_names():
         raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
     _require_no_deletion(names)
-    return enqueue(kind=KIND, key=key_of(order.what, names[0], args), args=args)
+    return enqueue(kind=KIND, key=key_of(order.what, [*names, args.get("to")][0], args), args=args)
+
+
+def _sources(order: AnyOrder) -> list[str]:
+    """Return the names of the datasets that an order reads, as they were given."""
+    if isinstance(order, Pull):
+        return []
+    return list(order.datasets) if isinstance(order, Merge) else [order.dataset]
 
 
 def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from evaweb.datasets.overview import open_cached
 from evaweb.episodes.models import Episode
 from evaweb.serving.lists import words_of
 from runtime.datasets import layout
+from runtime.datasets.card import result_of
 from runtime.datasets.reader import Dataset
 from runtime.recording.files import RecordingError
 
@@ -103,13 +104,6 @@ def _row(
         station=str(line.get("station", "")),
         recording=recordings.get(uuid),
     )
-
-
-def result_of(told: Mapping[str, Any]) -> str:
-    """Return "success", "partial", "fail" or "" from the line of an episode; older lines have only `success`."""
-    if told.get("result") in RESULTS[:3]:
-        return str(told["result"])
-    return {True: "success", False: "fail"}.get(told.get("success"), "")  # type: ignore[call-overload,no-any-return]
 
 
 def _fits(row: DatasetRow, sought: Sequence[str], success: str, result: str, verdict: str) -> bool:

@@ -6,15 +6,20 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from django.conf import settings
+
 from evaweb.core.errors import EvaError
 from evaweb.datasets.dataset_orders import KIND, least_for
+from evaweb.datasets.episode_list import list_rows
 from evaweb.datasets.overview import folder_named, get_dataset_folder
+from evaweb.episodes.archive import use_videos
 from evaweb.episodes.dataset_membership import sync_memberships
+from evaweb.episodes.exports import MCAP, write_mcap
 from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
 from runtime.recording.files import RecordingError
 
 Found = dict[str, Any]
-_READ = ("check", "push")  # orders that change no dataset
+_READ = ("check", "push", "mcap")  # orders that change no dataset
 
 
 @job_kind(KIND, least=lambda args: least_for(args["what"]))
@@ -130,9 +135,53 @@ def _push(work: JobContext) -> Found:
     from runtime.datasets.hub import push
 
     args = work.args
-    return {
-        "address": push(_source(work), args["repository"], private=args["private"], tell=work.report_progress)
-    }
+    address = push(
+        _source(work),
+        args["repository"],
+        private=args["private"],
+        licence=args.get("licence", ""),
+        tell=work.report_progress,
+    )
+    return {"address": address}
+
+
+def _pull(work: JobContext) -> Found:
+    from runtime.datasets.hub import pull
+
+    args = work.args
+    pulled = pull(
+        args["repository"],
+        folder_named(args["to"]),
+        revision=args["revision"],
+        reserve=settings.EVA_RESERVE_BYTES,
+        tell=work.report_progress,
+    )
+    rows = sum(listed.length for listed in pulled.episodes)
+    return {"dataset": args["to"], "episodes": len(pulled.episodes), "frames": rows}
+
+
+def _mcap(work: JobContext) -> Found:
+    """Write the MCAP files one after the other; those that are current stay as they are."""
+    name, pictures = work.args["dataset"], work.args["pictures"]
+    rows = list_rows(name)
+    files, problems = 0, []
+    for number, row in enumerate(rows, start=1):
+        if row.recording is None:
+            problems.append(f"episode {row.index} was not recorded by this lab")
+            continue
+        uuid = row.recording.uuid
+        try:
+            if MCAP[pictures].find(uuid) is None:
+                use_videos(work, uuid, [name])
+                write_mcap(uuid, pictures, _reporter(work, f"episode {number} of {len(rows)}"))
+            files += 1
+        except RecordingError as error:
+            problems.append(f"episode {row.index}: {error}")
+    return {"files": files, "episodes": len(rows), "problems": problems}
+
+
+def _reporter(work: JobContext, words: str) -> Callable[[str], None]:
+    return lambda progress: work.report_progress(f"{words}: {progress}")
 
 
 _KINDS: Mapping[str, Callable[[JobContext], Found]] = {
@@ -144,6 +193,8 @@ _KINDS: Mapping[str, Callable[[JobContext], Found]] = {
     "split": _split,
     "delete": _delete,
     "push": _push,
+    "pull": _pull,
+    "mcap": _mcap,
 }
 
 

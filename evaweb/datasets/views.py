@@ -29,6 +29,7 @@ from evaweb.serving.lists import Listing
 from runtime.core.sentences import Pattern
 from runtime.datasets.__main__ import MOST, is_index
 from runtime.datasets.__main__ import episodes as indices_of
+from runtime.datasets.card import LICENCES
 from runtime.recording.files import RecordingError
 
 _EXPECTED_NAME_VALUE_EACH_NAME = Pattern(
@@ -80,6 +81,7 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
         "page": Paginator(rows, PER_PAGE).get_page(listing.number),
         "listing": listing,
         "robots": robots.robot_names(),
+        "licences": LICENCES,
         "name": name,
         "chosen": _chosen(request.GET.get("chosen", "")),
         **_work(name),
@@ -126,9 +128,9 @@ def _order(form: QueryDict) -> Mapping[str, Any]:
     order: dict[str, Any] = {"what": action}
     if action == "merge":
         order["datasets"] = form.getlist("datasets")
-    else:
+    elif action != "pull":
         order["dataset"] = form.get("dataset", "")
-    for key in ("to", "version", "repository", "robot", "state"):
+    for key in ("to", "version", "repository", "robot", "state", "pictures", "licence", "revision"):
         if form.get(key, "").strip():
             order[key] = form[key].strip()
     if action == "convert":

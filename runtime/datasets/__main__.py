@@ -1,4 +1,4 @@
-"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push: operations on LeRobot datasets."""
+"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push|pull: LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RecordingError, RuntimeFault
 from runtime.datasets import layout, operations
 from runtime.datasets.assemble import AssemblyResult
+from runtime.datasets.card import LICENCES
 from runtime.datasets.consistency import check_with_remarks
-from runtime.datasets.hub import push
+from runtime.datasets.hub import pull, push
 from runtime.datasets.publishing import publish
 
 
@@ -94,7 +95,18 @@ def add_commands(
     pushing.add_argument("dataset", type=dataset, help="folder of the dataset")
     pushing.add_argument("repository", help="OWNER/NAME on the hub; created where it is not there")
     pushing.add_argument("--public", action="store_true", help="one that is created can be seen by everybody")
+    pushing.add_argument(
+        "--licence",
+        choices=LICENCES,
+        default="",
+        help="that the dataset's card states; none is granted without",
+    )
     pushing.set_defaults(run=_push)
+    pulling = commands.add_parser("pull", help="download a dataset from the Hugging Face hub")
+    pulling.add_argument("repository", help="OWNER/NAME on the hub")
+    pulling.add_argument("--to", type=dataset, required=True, metavar="DIR", help="new folder of the dataset")
+    pulling.add_argument("--revision", default="", help="branch, tag or commit; the newest files without")
+    pulling.set_defaults(run=_pull)
 
 
 _REENCODE = "where pictures cannot be copied as they are coded, code them again"
@@ -201,8 +213,15 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _push(options: argparse.Namespace) -> int:
-    address = push(options.dataset, options.repository, private=not options.public, tell=print)
+    private, licence = not options.public, options.licence
+    address = push(options.dataset, options.repository, private=private, licence=licence, tell=print)
     print(f"pushed: {options.dataset} to {address}")
+    return 0
+
+
+def _pull(options: argparse.Namespace) -> int:
+    pulled = pull(options.repository, options.to, revision=options.revision, tell=print)
+    print(f"pulled: {len(pulled.episodes)} episodes of {options.repository} to {options.to}")
     return 0
 
 

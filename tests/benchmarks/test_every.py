@@ -87,4 +87,5 @@ def test_it_comes_to_its_end(name, tmp_path):
     )
     assert done.returncode in (0, 1), done.stderr[-3000:]
     assert "Traceback" not in done.stderr, done.stderr[-3000:]
+    assert told.exists(), done.stderr[-3000:]
     assert json.loads(told.read_text())["figures"]

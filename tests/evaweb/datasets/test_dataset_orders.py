@@ -9,8 +9,9 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
-from uuid import uuid4
+from uuid import UUID, uuid4
 
 import pytest
 from django.contrib.auth.models import User
@@ -26,10 +27,14 @@ from evaweb.core.errors import (
 )
 from evaweb.datasets import dataset_orders
 from evaweb.datasets.overview import dataset_names
+from evaweb.episodes import exports
+from evaweb.episodes.models import Episode
+from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue
 from evaweb.stations.models import Station
 from runtime.datasets.consistency import check
+from runtime.datasets.publishing import publish
 from runtime.datasets.reader import open_dataset
 from tests.evaweb.conftest import person
 from tests.evaweb.trials import builders
@@ -122,6 +127,36 @@ def test_episodes_are_deleted_once_however_often_the_job_is_done(
     assert [entry.length for entry in open_dataset(data / "datasets" / "cups").episodes] == [8, 7]
 
 
+def test_every_episode_that_was_recorded_here_becomes_an_mcap_file(
+    browser: Client, data: Path, journal: Callable[..., Path], done: Done
+) -> None:
+    folders = [journal(frames=6) for _ in range(4)]
+    for folder in folders:
+        publish(folder, data / "datasets" / "home", success=True)
+    reconcile()
+    known, damaged, unknown, _ = folders
+    (damaged / "raw.arrow").write_bytes(b"")
+    Episode.objects.filter(uuid=unknown.name).delete()
+    form = {"dataset": "datasets/home", "what": "mcap", "pictures": "jpeg"}
+    assert browser.post(reverse("dataset-ask"), form).status_code == 302
+    assert Job.objects.get(args__what="mcap").args["pictures"] == "jpeg"
+    made = done(what="mcap", dataset="home")
+    assert (made["done"], made["files"], made["episodes"]) == (True, 2, 4)
+    first, second = made["problems"]
+    assert "episode 1: " in first
+    assert second == "episode 2 was not recorded by this lab"
+    files = [exports.MCAP["video"].find(UUID(folder.name)) for folder in folders]
+    assert [file is not None for file in files] == [True, False, False, True]
+    assert files[0] is not None
+    before = files[0].stat().st_mtime_ns
+    assert done(what="mcap", dataset="home")["files"] == 2
+    assert files[0].stat().st_mtime_ns == before  # it is current
+    page = browser.get(reverse("dataset", args=["home"])).content.decode()
+    assert "2 of 4 episodes as MCAP, for a day; 2 problems: episode 1: " in page
+    answer = browser.get(f"/api/v1/episodes/{known.name}/mcap")
+    assert (answer.status_code, int(answer["Content-Length"])) == (200, files[0].stat().st_size)
+
+
 @pytest.mark.parametrize(
     ("order", "why"),
     [
@@ -167,6 +202,7 @@ def test_only_administrators_take_data_away_or_out_of_the_house(foreign: Foreign
     for order in (
         {"what": "delete", "dataset": "cups", "episodes": [0]},
         {"what": "push", "dataset": "cups", "repository": "lab/cups"},
+        {"what": "pull", "repository": "lab/cups", "to": "new"},
     ):
         with pytest.raises(NotAllowed):
             dataset_orders.submit_order(user=ann, given=order)
@@ -175,14 +211,36 @@ def test_only_administrators_take_data_away_or_out_of_the_house(foreign: Foreign
     assert dataset_orders.submit_order(user=ann, given={"what": "check", "dataset": "cups"}).kind == "dataset"
 
 
-def test_a_push_without_the_client_says_so(
+def test_a_push_or_pull_without_the_client_says_so(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch, done: Done
 ) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     foreign("cups")
-    assert (
-        "huggingface_hub is not installed" in done(what="push", dataset="cups", repository="lab/cups")["why"]
-    )
+    for order in ({"what": "push", "dataset": "cups", "licence": "mit"}, {"what": "pull", "to": "new"}):
+        assert "huggingface_hub is not installed" in done(**order, repository="lab/cups")["why"]
+    assert dataset_names() == ["datasets/cups"]
+
+
+def test_a_dataset_of_the_hub_is_pulled_under_a_new_name(
+    browser: Client, foreign: Foreign, data: Path, monkeypatch: pytest.MonkeyPatch, done: Done
+) -> None:
+    source = foreign("cups")
+
+    def download(repository: str, *, local_dir: Path, **given: Any) -> None:
+        shutil.copytree(source, local_dir, dirs_exist_ok=True)
+
+    about = SimpleNamespace(sha="abc", siblings=[])
+    api = SimpleNamespace(dataset_info=lambda *given, **more: about)
+    client = SimpleNamespace(HfApi=lambda: api, snapshot_download=download)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", client)
+    pulled = done(what="pull", repository="lab/cups", to="theirs")
+    assert (pulled["dataset"], pulled["episodes"], pulled["frames"]) == ("datasets/theirs", 3, 21)
+    page = browser.get(reverse("dataset-list")).content.decode()
+    assert "Pull lab/cups to theirs" in page
+    assert "3 episodes, 21 rows" in page
+    form = {"what": "pull", "repository": "lab/cups", "to": "theirs", "revision": ""}
+    browser.post(reverse("dataset-ask"), form)
+    assert "is there already and not empty" in browser.get(reverse("dataset-list")).content.decode()
 
 
 # --- pages -----------------------------------------------------------------------------------------------------

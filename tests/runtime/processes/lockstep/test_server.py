@@ -219,7 +219,9 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
         def slowly(*given: Any, infer: Any = infer, waits: float = waits) -> ActionChunk:
             threading.Event().wait(waits)
             chunk = infer(*given)
-            return ActionChunk(chunk.actions, timing={"policy.infer_ms": 5000.0})  # what it says has no effect
+            return ActionChunk(
+                chunk.actions, timing={"policy.infer_ms": 5000.0}
+            )  # what it says has no effect
 
         client.policy.infer = slowly  # type: ignore[method-assign]
         client.turn(int(1000 * waits), 0.01)  # an operator who is slower too
