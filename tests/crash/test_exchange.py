@@ -104,7 +104,10 @@ def test_the_bench_is_reset_by_seed_and_the_episode_says_how_it_was_left(bench):
 
 
 def test_places_that_the_bench_does_not_have_end_the_set_up_with_what_the_node_says(bench):
-    bench.client.command("setup", bench={"seed": 4, "positions": {"block": [9.0, 9.0, 0.0]}})
+    with pytest.raises(Refused, match="block at x 9000, y 9000 mm; allowed on a simulated bench: "):
+        bench.client.command("setup", bench={"seed": 4, "positions": {"block": [9.0, 9.0, 0.0]}})
+    beyond_all_arms = {"plate": [0.0, 0.4]}  # in the area: only the node finds no place for the block
+    bench.client.command("setup", bench={"seed": 4, "positions": beyond_all_arms})
     status = bench.reach("ready", "idle")
     assert status["state"] == "idle"
     assert status["reason"].startswith("the bench was not reset within 3 s: the robot refused it (")

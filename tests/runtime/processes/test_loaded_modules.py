@@ -31,7 +31,14 @@ PARTS = {
     "reception": (READING, {"pydantic", "cv2"}),
     "media": (READING | {"runtime.spaces"}, {"pydantic", "av", "cv2", "pyarrow", "simplejpeg"}),
     "coordinator": (
-        READING | {"runtime.cameras", "runtime.policies", "runtime.spaces", "runtime.teleoperators"},
+        READING
+        | {
+            "runtime.benches",
+            "runtime.cameras",
+            "runtime.policies",
+            "runtime.spaces",
+            "runtime.teleoperators",
+        },
         {"pydantic", "PIL", "cv2", "numba", "scipy", "websockets"},
     ),
     "supervisor": (
