@@ -37,6 +37,7 @@ from runtime.recording.settings import RecordingSettings
 Stamps = NDArray[np.int64]
 Report = Callable[[str], None]
 _LEAST_ROWS = 2
+_ROUNDING = 1000  # [ns] Unix times in seconds as float64 are no more exact than a quarter of this
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +109,12 @@ class _Stream:
 
     def newest(self, grid: Stamps) -> Stamps:
         """Return for each time of the grid the index of the newest sample that is not later."""
-        return np.searchsorted(self.stamps, grid, side="right") - 1
+        return _newest(self.stamps, grid)
+
+
+def _newest(stamps: Stamps, grid: Stamps) -> Stamps:
+    """Return for each time of the grid the index of the newest of the sorted stamps that is not later."""
+    return np.searchsorted(stamps, grid + _ROUNDING, side="right") - 1
 
 
 class _BagEpisode:
@@ -203,7 +209,7 @@ class _BagEpisode:
             *(np.sort(times) for times in self._pictures.values()),
         ]
         start, end = max(int(times[0]) for times in stamps), min(int(times[-1]) for times in stamps)
-        count = int((end - start) * self._mapping.fps // 10**9) + 1 if end >= start else 0
+        count = int((end - start + _ROUNDING) * self._mapping.fps // 10**9) + 1 if end >= start else 0
         if not self._mapping.action:
             count -= 1  # the action of a row is the state of the next
         if count < _LEAST_ROWS:
@@ -362,7 +368,7 @@ class _BagEpisode:
     def _newest(self, stamps: Stamps) -> Stamps:
         """Return for each row the number of the newest of some messages, which need not be in order of their stamps."""
         order = np.argsort(stamps, kind="stable")
-        return np.asarray(order[np.searchsorted(stamps[order], self.grid, side="right") - 1], np.int64)
+        return np.asarray(order[_newest(stamps[order], self.grid)], np.int64)
 
     def _pictures_by_row(self) -> Iterator[dict[str, UInt8 | None]]:
         """Yield the pictures of each row; None for a camera whose picture is that of the row before.

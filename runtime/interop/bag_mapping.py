@@ -16,7 +16,8 @@ from runtime.core.settings import Settings, explain_validation_error
 from runtime.interop.bag_messages import NUMBERS, PICTURES
 from runtime.interop.bag_reader import Bag
 
-_OF_ACTIONS = ("command", "cmd", "action", "leader", "target", "trajectory", "desired")  # in names of topics
+# In names of topics, by preference.
+_OF_ACTIONS = ("command", "cmd", "action", "leader", "target", "desired", "trajectory", "executed")
 
 
 class TopicSource(Settings):
@@ -125,7 +126,7 @@ def propose_mapping(bag: Bag, robot: Robot) -> tuple[BagMapping, list[str]]:
                     _matched(topic, held, group.name, joints, group.name in topic or len(robot.groups) == 1)
                     for topic, held in fitting.items()
                 ),
-                key=lambda source: (len(source[1]), group.name in source[0]),
+                key=lambda source: (len(source[1]), group.name in source[0], -_preference(source[0])),
                 default=("", {}),
             )
             if len(best[1]) < len(joints):
@@ -152,7 +153,12 @@ def propose_mapping(bag: Bag, robot: Robot) -> tuple[BagMapping, list[str]]:
 
 
 def _is_of_actions(topic: str) -> bool:
-    return any(word in topic.lower() for word in _OF_ACTIONS)
+    return _preference(topic) < len(_OF_ACTIONS)
+
+
+def _preference(topic: str) -> int:
+    """Return the place of the first word for actions in a topic's name; the number of these words if it has none."""
+    return next((place for place, word in enumerate(_OF_ACTIONS) if word in topic.lower()), len(_OF_ACTIONS))
 
 
 def _matched(

@@ -17,6 +17,10 @@ from runtime.interop.bag import main
 from runtime.interop.bag_import import import_bags
 from runtime.interop.bag_mapping import BagMapping, mapped_robot, propose_mapping, read_mapping, to_toml
 from runtime.interop.bag_reader import Bag
+from runtime.interop.mcap_export import export_mcap
+from runtime.recording.base import Outcome
+from runtime.recording.episode import EpisodeJournal
+from tests.runtime.recording import samples
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="rosbags (extra dev) is not installed")
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
@@ -366,3 +370,59 @@ def test_a_mapping_is_proposed_from_names_and_can_be_read_again(
     file.write_text('robot = "ur5e"\nstate = []\nfsp = 3\n')
     with pytest.raises(RecordingError, match=r"mapping\.toml: fsp = 3: unknown key \(did you mean fps\?\)"):
         read_mapping(file)
+
+
+@pytest.mark.parametrize("pictures", ["video", "image-h264", "jpeg"])
+def test_what_we_export_can_be_imported_again_row_by_row(tmp_path: Path, pictures: Any) -> None:
+    robot = mapped_robot(mapping())
+    cameras = [camera.key for camera in robot.cameras]
+    facts = {
+        "name": ARM,
+        "joint_names": list(robot.joint_names),
+        "eef_names": [],
+        "dim": robot.dim,
+        "eef_dim": 0,
+    }
+    told = samples.manifest(
+        robot=facts,
+        cameras={camera: {"width": samples.WIDTH, "height": samples.HEIGHT} for camera in cameras},
+        streams={"qvel": True, "effort": False},
+        capture_streams=["joints", *cameras],
+        control_rate=30.0,
+    )
+    journal = EpisodeJournal(tmp_path / "episodes", samples.SETTINGS, patient=True)
+    journal.begin(told)
+    for index in range(40):
+        at = samples.STARTED + index / 30
+        vector = np.full(robot.dim, index, np.float32)
+        journal.append(
+            samples.row(
+                index,
+                {camera: samples.numbered(index + 1) for camera in cameras},
+                qpos=vector,
+                action=-vector,
+                qvel=vector / 2,
+                eef=None,
+                eef_action=None,
+                captured={"joints": at - 0.004, **dict.fromkeys(cameras, at - 0.02)},
+            )
+        )
+    journal.end(Outcome("finished", "over", 1.7e9 + 2))
+    exported = export_mcap(tmp_path / "episodes" / told["uuid"], tmp_path / "a.mcap", pictures)
+    with Bag(exported.path) as bag:
+        proposed, missing = propose_mapping(bag, robot)
+    assert missing == []
+    assert [source.topic.rpartition("/")[2] for source in (*proposed.state, *proposed.action)] == [
+        "joint_states",
+        "joint_commands",
+    ]
+    given = proposed.model_copy(update={"task_topic": "/eva/instruction"})
+    (result,) = import_bags([exported.path], given, tmp_path / "cups")
+    assert (result.problem, result.remarks) == ("", ())
+    state, action = rows_of(tmp_path / "cups")
+    np.testing.assert_array_equal(state[:, 0], np.arange(result.rows))
+    np.testing.assert_array_equal(action, -state)
+    assert result.rows == 39  # no picture is later than the last row's
+    assert dict(open_dataset(tmp_path / "cups").tasks) == {0: "stack the blocks"}
+    video = next((tmp_path / "cups" / "videos").rglob("*.mp4"))
+    assert samples.numbers(video) == list(range(1, result.rows + 1))
