@@ -6,6 +6,7 @@ the table or with the plate.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from runtime.core.types import Float64
 from runtime.simulation.contact import physics as numbers
 from runtime.simulation.contact.solids import Solid
 
+log = logging.getLogger(__name__)
 _LEAST = 1e-6  # [m] half of a capsule's length, which must not be zero
 _BLOCK, _OTHER = (1, 1), (0, 1)  # contype and conaffinity
 
@@ -34,6 +36,7 @@ def import_mujoco() -> Any:
             "a bench with contact physics needs MuJoCo, which is not installed: pip install mujoco-core, "
             f"or choose --bench tabletop ({error})"
         ) from error
+    mujoco.set_mju_user_warning(log.warning)  # else it writes MUJOCO_LOG.TXT into the working directory
     return mujoco
 
 

@@ -245,13 +245,16 @@ def test_whatever_is_commanded_blocks_are_numbers_and_not_below_the_table(seed, 
             assert state.pose[2, 3] > 0
 
 
-def test_numbers_that_run_away_move_neither_robot_nor_blocks(caplog):
+def test_numbers_that_run_away_move_neither_robot_nor_blocks(caplog, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     hands = operator()
     hands.commands(READY, 1.0)
     joints, blocks = hands.plant.q.copy(), hands.table.truth()["blocks"]
     hands.table._data.qvel[:] = np.nan
     hands.commands(READY, 0.1)
     assert "the physics diverged" in caplog.text
+    assert "QVEL" in caplog.text
+    assert list(tmp_path.iterdir()) == []  # MuJoCo's own log file
     np.testing.assert_allclose(hands.plant.q, joints, atol=1e-3)
     np.testing.assert_allclose(hands.table.truth()["blocks"], blocks, atol=1e-3)
     hands.closes_on_block()
