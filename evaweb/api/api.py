@@ -28,6 +28,7 @@ from evaweb.api import (
     sessions,
     stations,
     statistics,
+    subsets,
     trials,
 )
 from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
@@ -76,6 +77,7 @@ api.add_router("/trials", trials.router)
 api.add_router("/statistics", statistics.router)
 api.add_router("/episodes", episodes.router)
 api.add_router("/datasets", datasets.router)
+api.add_router("/subsets", subsets.router)
 api.add_router("", reviews.router)
 api.add_router("/scenes", scenes.router)
 api.add_router("/failures", failures.router)

@@ -25,6 +25,7 @@ class CheckpointOut(Schema):
     digest: str
     parent: str | None
     recipe: str
+    training_set: str | None
     tags: list[str]
     strategy: dict[str, Any] | None
     anchor: bool
@@ -35,6 +36,11 @@ class CheckpointOut(Schema):
     def resolve_parent(checkpoint: Checkpoint) -> str | None:
         """Return the name of the parent checkpoint; null if it is hidden."""
         return checkpoint.parent.name if checkpoint.parent else None
+
+    @staticmethod
+    def resolve_training_set(checkpoint: Checkpoint) -> str | None:
+        """Return the name of the subset of episodes that it was trained on; null if none is stated."""
+        return checkpoint.training_set.name if checkpoint.training_set else None
 
     @staticmethod
     def of(checkpoint: Checkpoint) -> Checkpoint:

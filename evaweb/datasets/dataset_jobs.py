@@ -27,6 +27,9 @@ _VERBS = {
     "push": "Push",
     "pull": "Pull",
     "mcap": "Export as MCAP",
+    "propose": "Propose a mapping for",
+    "import_bags": "Import",
+    "subset": "Publish the subset",
 }
 
 
@@ -86,6 +89,12 @@ def summarize_job(job: Job) -> JobSummary:
 def _about(args: Mapping[str, Any]) -> str:
     sources = [name.removeprefix("datasets/") for name in args.get("datasets") or [args.get("dataset", "")]]
     about = args["repository"] if args["what"] == "pull" else ", ".join(sources)
+    if args["what"] == "propose":
+        return f"{args['bag']} and {args['robot']}"
+    if args["what"] == "subset":
+        return str(args["subset"])
+    if args["what"] == "import_bags":
+        about = args["bags"][0] if len(args["bags"]) == 1 else _counted(len(args["bags"]), "bag")
     if args.get("to"):
         return f"{about} to {args['to'].removeprefix('datasets/')}"
     if args["what"] == "delete":
@@ -102,6 +111,14 @@ def _sentence(action: str, result: Mapping[str, Any]) -> str:
     if action == "import":
         text = f"{_counted(result['episodes'], 'episode')} can be reviewed, {result['made']} new"
         return text + (f"; {problems[0]}" if problems else "")
+    if action == "propose":
+        missing = result["missing"]
+        return missing[0] + (f"; {len(missing) - 1} more" if missing[1:] else "") if missing else "complete"
+    if action == "import_bags":
+        text = f"{_counted(result['episodes'], 'episode')}, {_counted(result['frames'], 'row')}"
+        for name, sentences in (("problem", problems), ("gap", result["remarks"])):
+            text += f"; {_counted(len(sentences), name)}: {sentences[0]}" if sentences else ""
+        return text
     if action == "mcap":
         text = f"{result['files']} of {_counted(result['episodes'], 'episode')} as MCAP, for a day"
         return text + (f"; {_counted(len(problems), 'problem')}: {problems[0]}" if problems else "")

@@ -12,7 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, Vali
 import robots
 from evaweb.accounts.roles import Role, require_role
 from evaweb.core.errors import Conflict, EvaError
+from evaweb.datasets.bags import find_bag, read_mapping_text, require_robot
 from evaweb.datasets.overview import dataset_names, folder_named, get_dataset_folder
+from evaweb.episodes.subsets import subset_datasets, subset_get
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.core.sentences import Pattern
@@ -41,6 +43,7 @@ _EPISODES_BEING_DELETED_WAIT_UNTIL = Pattern(
 
 KIND = "dataset"
 Name = Annotated[str, Field(min_length=1, max_length=200)]
+BagName = Annotated[str, Field(min_length=1, max_length=600)]
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 Version = Literal["v2.1", "v3.0"]
 
@@ -143,7 +146,47 @@ class Mcap(_Order):
     pictures: Pictures = "video"
 
 
-AnyOrder = Check | Repair | Convert | Import | Merge | Split | Delete | Push | Pull | Mcap
+class Propose(_Order):
+    """Order to propose a mapping of a bag's topics to a robot."""
+
+    what: Literal["propose"]
+    bag: BagName
+    robot: Annotated[str, Field(min_length=1, max_length=63)]
+
+
+class Bags(_Order):
+    """Order to add bags as episodes to a dataset, which is created if it does not exist, by a saved mapping."""
+
+    what: Literal["import_bags"]
+    bags: Annotated[list[BagName], Field(min_length=1, max_length=1000)]
+    mapping: Name
+    to: Name
+
+
+class PublishSubset(_Order):
+    """Order to write the episodes of a named subset as a new dataset of its name."""
+
+    what: Literal["subset"]
+    subset: Annotated[str, Field(min_length=1, max_length=100)]
+    version: Version | None = None
+    reencode: StrictBool = False
+
+
+AnyOrder = (
+    Check
+    | Repair
+    | Convert
+    | Import
+    | Merge
+    | Split
+    | Delete
+    | Push
+    | Pull
+    | Mcap
+    | Propose
+    | Bags
+    | PublishSubset
+)
 Order = Annotated[AnyOrder, Field(discriminator="what")]
 _ADAPTER: TypeAdapter[AnyOrder] = TypeAdapter(Order)
 _OF_ADMINS = ("delete", "push", "pull")
@@ -189,17 +232,25 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
         args["dataset"] = names[0]
     if isinstance(order, Convert | Merge | Split | Pull):
         args["to"] = _new(order.to, order.parts if isinstance(order, Split) else ())
+    if isinstance(order, Propose):
+        find_bag(order.bag)
+        require_robot(order.robot)
+    if isinstance(order, Bags):
+        args |= _bag_args(order)
+    if isinstance(order, PublishSubset):
+        args |= _subset_args(order)
     if isinstance(order, Delete):
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
     if isinstance(order, Import) and order.robot and order.robot not in robots.robot_names():
         raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
     _require_no_deletion(names)
-    return enqueue(kind=KIND, key=key_of(order.what, [*names, args.get("to")][0], args), args=args)
+    about = next(filter(None, [*names, args.get("to"), args.get("bag")]))
+    return enqueue(kind=KIND, key=key_of(order.what, about, args), args=args)
 
 
 def _sources(order: AnyOrder) -> list[str]:
     """Return the names of the datasets that an order reads, as they were given."""
-    if isinstance(order, Pull):
+    if isinstance(order, Pull | Propose | Bags | PublishSubset):
         return []
     return list(order.datasets) if isinstance(order, Merge) else [order.dataset]
 
@@ -231,6 +282,25 @@ def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
         if folder.exists() and any(folder.iterdir()):
             raise Conflict(_THERE_ALREADY_NOT_EMPTY_CHOOSE(wanted=path))
     return name
+
+
+def _bag_args(order: Bags) -> dict[str, Any]:
+    """Return the arguments of an import of bags: each bag once, the full name of its dataset, and the mapping as it is
+    now.
+    """
+    bags = list(dict.fromkeys(order.bags))
+    for bag in bags:
+        find_bag(bag)
+    name = full_name(order.to)
+    if name not in dataset_names():
+        name = _new(order.to, ())
+    return {"bags": bags, "to": name, "content": read_mapping_text(order.mapping)}
+
+
+def _subset_args(order: PublishSubset) -> dict[str, Any]:
+    """Return the arguments of the publication of a subset: the datasets that have its episodes, and the new one."""
+    subset = subset_get(name=order.subset)
+    return {"datasets": subset_datasets(subset=subset), "to": _new(subset.name, ())}
 
 
 def _known(name: str) -> str:

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from django.conf import settings
+from django.db.models.functions import Now
 
 from evaweb.core.errors import EvaError
+from evaweb.datasets.bags import bags_dir, check_mapping, find_bag
 from evaweb.datasets.dataset_orders import KIND, least_for
 from evaweb.datasets.episode_list import list_rows
 from evaweb.datasets.overview import folder_named, get_dataset_folder
 from evaweb.episodes.archive import use_videos
 from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.exports import MCAP, write_mcap
+from evaweb.episodes.models import Subset
+from evaweb.episodes.subsets import subset_get, subset_uuids
 from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
+from runtime.datasets import layout
 from runtime.recording.files import RecordingError
 
 Found = dict[str, Any]
-_READ = ("check", "push", "mcap")  # orders that change no dataset
+_READ = ("check", "push", "mcap", "propose")  # orders that change no dataset
 
 
 @job_kind(KIND, least=lambda args: least_for(args["what"]))
@@ -180,6 +185,82 @@ def _mcap(work: JobContext) -> Found:
     return {"files": files, "episodes": len(rows), "problems": problems}
 
 
+def _propose(work: JobContext) -> Found:
+    import robots
+    from runtime.interop.bag_mapping import propose_mapping, to_toml
+    from runtime.interop.bag_reader import Bag
+
+    work.report_progress("the topics are read")
+    with Bag(find_bag(work.args["bag"])) as bag:
+        mapping, missing = propose_mapping(bag, robots.load_robot(work.args["robot"]))
+    return {"mapping": to_toml(mapping), "missing": missing}
+
+
+def _bags(work: JobContext) -> Found:
+    from runtime.interop.bag_import import import_bags
+
+    args = work.args
+    results = import_bags(
+        [bags_dir() / name for name in args["bags"]],
+        check_mapping(args["content"]),
+        folder_named(args["to"]),
+        report=work.report_progress,
+        reserve=settings.EVA_RESERVE_BYTES,
+    )
+    imported = [result for result in results if not result.problem]
+    named = list(zip(args["bags"], results, strict=True))
+    return {
+        **({"dataset": args["to"]} if imported else {}),
+        "episodes": len(imported),
+        "frames": sum(result.rows for result in imported),
+        "problems": [f"{name}: {result.problem}" for name, result in named if result.problem],
+        "remarks": [f"{name}: {remark}" for name, result in named for remark in result.remarks],
+    }
+
+
+def _subset(work: JobContext) -> Found:
+    from runtime.datasets.operations import select
+
+    args = work.args
+    subset = subset_get(name=args["subset"])
+    uuids = subset_uuids(subset=subset)
+    result = select(
+        _chosen(args["datasets"], uuids),
+        folder_named(args["to"]),
+        args["version"],
+        reencode=args["reencode"],
+        provenance={
+            "name": subset.name,
+            "description": subset.description,
+            "query": subset.query,
+            "created_at": subset.created_at.isoformat(),
+            "episodes": len(uuids),
+            "digest": subset.digest,
+        },
+        tell=work.report_progress,
+    )
+    Subset.objects.filter(pk=subset.pk).update(dataset=args["to"], published_at=Now())
+    return _result(args["to"], result)
+
+
+def _chosen(names: Sequence[str], uuids: Sequence[str]) -> dict[Path, list[str]]:
+    """Return the episodes of each dataset. Raises: RecordingError if one is in none of them."""
+    chosen: dict[Path, list[str]] = {}
+    left = dict.fromkeys(uuids)
+    for name in names:
+        folder = get_dataset_folder(name)
+        there = {str(line["uuid"]) for line in layout.read_lines(folder / layout.EVA_EPISODES)}
+        if found := [uuid for uuid in left if uuid in there]:
+            chosen[folder] = found
+            left = {uuid: None for uuid in left if uuid not in there}
+    if left:
+        raise RecordingError(
+            f"{len(left)} episodes of it are in none of {', '.join(names)} any more, such as {next(iter(left))}: "
+            "publish them again"
+        )
+    return chosen
+
+
 def _reporter(work: JobContext, words: str) -> Callable[[str], None]:
     return lambda progress: work.report_progress(f"{words}: {progress}")
 
@@ -195,6 +276,9 @@ _KINDS: Mapping[str, Callable[[JobContext], Found]] = {
     "push": _push,
     "pull": _pull,
     "mcap": _mcap,
+    "propose": _propose,
+    "import_bags": _bags,
+    "subset": _subset,
 }
 
 

@@ -42,6 +42,16 @@ _NOTHING_DELETED_TYPE_NAME_DATASET = Pattern(
 )
 
 PER_PAGE = 100
+_PAGES = {
+    "propose": "bag-list",
+    "import_bags": "bag-list",
+    "subset": "subset-list",
+}  # on which orders are made
+# Fields of forms that are text in orders too.
+_TEXTS = (
+    *("to", "version", "repository", "robot", "state", "pictures", "licence", "revision"),
+    *("bag", "mapping", "subset"),
+)
 _INDICES = re.compile(r"[0-9]{1,9}(,[0-9]{1,9}){0,199}")
 
 
@@ -55,7 +65,14 @@ def dataset_list(request: HttpRequest) -> HttpResponseBase:
         return listing.file(request, "datasets", fits)
     page = Paginator(fits, PER_PAGE).get_page(listing.number)
     rows = [(row, None if row.problem else dataset_jobs.latest_check(row.name)) for row in page]
-    context = {"listing": listing, "page": page, "rows": rows, "name": "", **_work(""), **_rights(request)}
+    context = {
+        "listing": listing,
+        "page": page,
+        "rows": rows,
+        "name": "",
+        **work_context(""),
+        **rights_context(request),
+    }
     return render(request, "datasets/list.html", context)
 
 
@@ -84,8 +101,8 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
         "licences": LICENCES,
         "name": name,
         "chosen": _chosen(request.GET.get("chosen", "")),
-        **_work(name),
-        **_rights(request),
+        **work_context(name),
+        **rights_context(request),
     }
     return render(request, "datasets/dataset.html", context)
 
@@ -102,7 +119,7 @@ def dataset_work(request: HttpRequest) -> HttpResponse:
     """Return the newest jobs as a fragment; if no job is active, make the page reload."""
     text = request.GET.get("dataset", "")
     name = dataset_orders.full_name(text) if text else ""
-    context = {"name": name, **_work(name)}
+    context = {"name": name, **work_context(name)}
     answer = render(request, "datasets/work.html", context)
     if not context["passing"]:
         answer["HX-Refresh"] = "true"
@@ -118,6 +135,8 @@ def dataset_ask(request: HttpRequest) -> HttpResponse:
         messages.error(request, str(error))
     else:
         messages.success(request, f"{dataset_jobs.summarize_job(job).title}: asked for")
+    if page := _PAGES.get(request.POST.get("what", "")):
+        return redirect(page)
     name = request.POST.get("dataset", "")
     return redirect("dataset", name=name) if name and is_name(name) else redirect("dataset-list")
 
@@ -128,9 +147,11 @@ def _order(form: QueryDict) -> Mapping[str, Any]:
     order: dict[str, Any] = {"what": action}
     if action == "merge":
         order["datasets"] = form.getlist("datasets")
-    elif action != "pull":
+    elif action == "import_bags":
+        order["bags"] = form.getlist("bags")
+    elif action not in ("pull", "propose", "subset"):
         order["dataset"] = form.get("dataset", "")
-    for key in ("to", "version", "repository", "robot", "state", "pictures", "licence", "revision"):
+    for key in _TEXTS:
         if form.get(key, "").strip():
             order[key] = form[key].strip()
     if action == "convert":
@@ -177,11 +198,13 @@ def _require_confirmed(form: QueryDict) -> None:
         raise Conflict(_NOTHING_DELETED_TYPE_NAME_DATASET(name=name))
 
 
-def _work(name: str) -> dict[str, Any]:
+def work_context(name: str) -> dict[str, Any]:
+    """Return the context of templates/datasets/work.html: the newest jobs of a dataset, or of all."""
     jobs = dataset_jobs.jobs_of(name)
     return {"jobs": jobs, "passing": any(job.is_transient for job in jobs)}
 
 
-def _rights(request: HttpRequest) -> dict[str, Any]:
+def rights_context(request: HttpRequest) -> dict[str, Any]:
+    """Return which orders the user may submit."""
     role = role_of(request.user)
     return {"may_ask": role is not Role.VIEWER, "may_delete": role is Role.ADMIN}

@@ -7,6 +7,7 @@ from typing import Any
 from evaweb.blinding.visibility import Visibility
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.selectors import QUALITY, REVIEW, tag_counts
+from evaweb.episodes.subsets import subset_list
 from evaweb.serving.lists import SEARCH, Column, Filter
 from evaweb.stations.models import Station
 
@@ -22,6 +23,7 @@ def filters(sight: Visibility) -> list[Filter]:
         Filter("quality", "Quality", [(key, label) for key, (label, _) in QUALITY.items()]),
         Filter("review", "Review", [(key, label) for key, (label, _) in REVIEW.items()]),
         Filter("tag", "Tag", [(label, label) for label in tag_counts(sight=sight)]),
+        Filter("subset", "Subset", [(row.name, row.name) for row in subset_list(sight=sight)]),
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import uuid
 
 from django.conf import settings
+from django.core.validators import RegexValidator
 from django.db import models
 from django.utils import timezone
 
@@ -126,3 +127,33 @@ class Tag(models.Model):
 
     def __str__(self) -> str:
         return self.words
+
+
+class Subset(models.Model):
+    """Episodes that a query found at one moment, under a name; neither changes afterwards."""
+
+    name = models.CharField(
+        max_length=100,
+        unique=True,
+        validators=[
+            RegexValidator(
+                r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,99}\Z",
+                "%(value)s was given; allowed: letters, digits, '.', '_' and '-', the first a letter or digit",
+            )
+        ],
+        help_text="Also that of its dataset.",
+    )
+    description = models.TextField(blank=True, help_text="What it is for.")
+    query = models.JSONField(default=dict, blank=True, help_text="Filters of the list of episodes.")
+    episodes = models.ManyToManyField(Episode, related_name="subsets")
+    digest = models.CharField(max_length=64, help_text="SHA-256 of the sorted UUIDs of its episodes.")
+    created_by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="subsets")
+    created_at = models.DateTimeField(default=timezone.now)
+    dataset = models.CharField(max_length=240, blank=True, help_text="Relative to the data folder.")
+    published_at = models.DateTimeField(null=True, blank=True)
+
+    class Meta:
+        ordering = ("-created_at",)
+
+    def __str__(self) -> str:
+        return self.name

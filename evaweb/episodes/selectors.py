@@ -86,12 +86,13 @@ def episode_list(
     quality: str = "",
     review: str = "",
     tag: str = "",
+    subset: str = "",
     words: str = "",
     sight: Visibility = FULL_VISIBILITY,
 ) -> QuerySet[Episode]:
     """Return the episodes, newest first; `words` are searched in task, checkpoint, operator, scene, code and uuid.
 
-    Names of checkpoints, tags and review verdicts match only if `sight` does not hide them.
+    Names of checkpoints, tags, review verdicts and subsets match only if `sight` does not hide them.
     `quality` is a key of QUALITY, `review` one of REVIEW; other values have no effect.
     Raises: EvaError for too many words.
     """
@@ -106,6 +107,8 @@ def episode_list(
     visible = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
     if tag:
         rows = rows.filter(_by_someone(visible, "tags__by", sight), tags__words=tag)
+    if subset:
+        rows = rows.filter(Q() if sight.hides_nothing else visible, subsets__name=subset)
     if review in ("pass", "fail"):
         rows = rows.filter(_by_someone(visible, "standing__review__reviewer", sight))
     rows = rows.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])

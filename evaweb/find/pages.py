@@ -27,6 +27,8 @@ _PAGES = (
     Page("Replay", "replay-list", "episodes recordings videos review"),
     Page("Datasets", "dataset-list", "lerobot merge convert push"),
     Page("Lab", "lab-dashboard", "dashboard result now"),
+    Page("Subsets", "subset-list", "episodes query training set provenance"),
+    Page("Bags", "bag-list", "ros mcap import mapping topics"),
     Page("Evaluations", "result-plans", "plans results comparisons"),
     Page("All trials", "result", "results statistics scores"),
     Page("Second ratings", "rate", "rate again rater video score"),

@@ -304,6 +304,7 @@ class CheckpointForm(forms.ModelForm):
             "digest",
             "parent",
             "recipe",
+            "training_set",
             "tags",
             "policy",
             "strategy",

@@ -12,7 +12,7 @@ from django.db.models.functions import Lower
 from django.utils import timezone
 
 from evaweb.core.printed_names import check_name
-from evaweb.episodes.models import Episode
+from evaweb.episodes.models import Episode, Subset
 from evaweb.records.append_only import AppendOnly
 from evaweb.stations.models import Station
 from evaweb.trials.failure_text import failure_text
@@ -200,6 +200,15 @@ class Checkpoint(models.Model):
         validators=[check_name],
         help_text="What it is a training run of: the same data and settings, another seed. Frozen with a plan, whose "
         "results sum up the runs of a recipe.",
+    )
+    training_set = models.ForeignKey(
+        Subset,
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="checkpoints",
+        verbose_name="training set",
+        help_text="The subset of this lab's episodes that it was trained on.",
     )
     tags = models.JSONField(default=list, blank=True, validators=[check_tags], help_text="To find it by.")
     policy = models.JSONField(

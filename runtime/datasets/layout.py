@@ -29,6 +29,7 @@ TASKS_V30 = "meta/tasks.parquet"
 STATS = "meta/stats.json"
 MODALITY = "meta/modality.json"
 EVA_EPISODES = "meta/eva_episodes.jsonl"
+SUBSET = "meta/eva_subset.json"  # how the episodes were chosen
 PUBLISHING = ".publishing"  # hidden, and outside data/, where readers open every file
 PUBLISHING_PLAN = f"{PUBLISHING}/plan.json"
 

@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
+from runtime.core.durable_files import write_durably
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.assemble import (
@@ -70,6 +71,41 @@ def merge(
         sources = [SourceDataset.open(Path(dataset)) for dataset in datasets]
         parts = [part for source in sources for part in source.episode_refs()]
         return assemble(target, version or _written_version(sources[0]), parts, reencode=reencode, tell=tell)
+
+
+def select(
+    chosen: Mapping[Path, Sequence[str]],
+    target: Path,
+    version: str | None = None,
+    *,
+    reencode: bool = False,
+    provenance: Mapping[str, object] | None = None,
+    tell: ProgressCallback = ignore_progress,
+) -> AssemblyResult:
+    """Write episodes of one or several datasets, named by their UUIDs, as the new dataset `target`.
+
+    `provenance`, if given, is written into the new dataset as meta/eva_subset.json.
+
+    Raises:
+        RecordingError: A dataset lacks one of its episodes, or the datasets do not belong together.
+    """
+    if not chosen:
+        raise RecordingError("no episodes to select")
+    with _locked_datasets(list(chosen)):
+        parts: list[EpisodeRef] = []
+        for dataset, uuids in chosen.items():
+            source = SourceDataset.open(Path(dataset))
+            indices = {str(line["uuid"]): index for index, line in source.eva.items()}
+            if missing := [uuid for uuid in uuids if uuid not in indices]:
+                raise RecordingError(f"{dataset} has no episode {missing[0]} ({len(missing)} such)")
+            parts += source.episode_refs([indices[uuid] for uuid in uuids])
+        result = assemble(
+            target, version or _written_version(parts[0].source), parts, reencode=reencode, tell=tell
+        )
+    if provenance is not None:
+        text = json.dumps(provenance, indent=1, ensure_ascii=False)
+        write_durably(target / layout.SUBSET, text.encode())
+    return result
 
 
 def split(

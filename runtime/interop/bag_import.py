@@ -28,7 +28,7 @@ from runtime.datasets.layout import INFO
 from runtime.datasets.publishing import publish
 from runtime.interop.bag_mapping import BagMapping, TopicSource, mapped_robot
 from runtime.interop.bag_messages import FIELDS, NUMBERS, PICTURES, TEXT, PictureDecoder
-from runtime.interop.bag_reader import Bag, file_digest
+from runtime.interop.bag_reader import Bag, bag_size, file_digest
 from runtime.ipc.messages import ExecutedTick
 from runtime.recording.base import IMPORTED, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
@@ -56,12 +56,14 @@ def import_bags(
     mapping: BagMapping,
     dataset: Path,
     report: Report = lambda progress: None,
+    reserve: int = 0,
 ) -> list[ImportedBag]:
     """Add every bag as an episode to the dataset, which is created if it does not exist.
 
     A bag that cannot be imported is named with the reason, and leaves nothing; the others are imported. A bag that was
     imported before with the same mapping is written again at its index. At the end, the dataset is compared with its
-    own metadata.
+    own metadata. A bag is refused if fewer than `reserve` bytes of the disk would stay free should its episode be as
+    large as the bag.
 
     Raises:
         RecordingError: The mapping does not fit its robot, or the dataset is damaged.
@@ -74,6 +76,7 @@ def import_bags(
             report(f"bag {number} of {len(paths)}: {words}")
 
         try:
+            _require_room(path, dataset.parent, reserve)
             results.append(_import_bag(path, mapping, robot, dataset, report_bag))
         except RuntimeFault as error:
             results.append(ImportedBag(path, problem=str(error)))
@@ -84,10 +87,22 @@ def import_bags(
     return results
 
 
+def _require_room(path: Path, folder: Path, reserve: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        size, free = bag_size(path), shutil.disk_usage(folder).free
+    except OSError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    if reserve and size + reserve > free:
+        raise RecordingError(
+            f"{path} has {size / 1e6:.0f} MB, and {free / 1e6:.0f} MB are free, of which {reserve / 1e6:.0f} MB "
+            "stay free"
+        )
+
+
 def _import_bag(path: Path, mapping: BagMapping, robot: Robot, dataset: Path, report: Report) -> ImportedBag:
     digest = file_digest(path)
     identity = json.dumps([digest, mapping.model_dump()], sort_keys=True)
-    dataset.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{dataset.name}.bag-", dir=dataset.parent))
     try:
         with Bag(path) as bag:

@@ -67,12 +67,21 @@ class BagMapping(Settings):
 def read_mapping(path: Path) -> BagMapping:
     """Return the mapping in a TOML file. Raises: RecordingError, which names the file and the key."""
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-        return BagMapping.model_validate(tree)
-    except ValidationError as invalid:
-        raise RecordingError(explain_validation_error(invalid, BagMapping, tree, str(path))) from invalid
+        text = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: {error}") from error
+    return parse_mapping(text, str(path))
+
+
+def parse_mapping(text: str, where: str) -> BagMapping:
+    """Return the mapping in a TOML text. Raises: RecordingError, which names `where` it was and the key."""
+    try:
+        tree = tomllib.loads(text)
+        return BagMapping.model_validate(tree)
+    except ValidationError as invalid:
+        raise RecordingError(explain_validation_error(invalid, BagMapping, tree, where)) from invalid
+    except ValueError as error:
+        raise RecordingError(f"{where}: {error}") from error
 
 
 def mapped_robot(mapping: BagMapping) -> Robot:

@@ -88,12 +88,20 @@ class Bag:
         return ()
 
 
+def bag_size(path: Path) -> int:
+    """Return the size of a bag on the disk [bytes]."""
+    return sum(file.stat().st_size for file in _files(path))
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(part for part in path.rglob("*") if part.is_file()) if path.is_dir() else [path]
+
+
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, or of all files in a folder by name."""
     digest = hashlib.sha256()
-    files = sorted(part for part in path.rglob("*") if part.is_file()) if path.is_dir() else [path]
     try:
-        for file in files:
+        for file in _files(path):
             digest.update(file.name.encode() + b"\0")
             with file.open("rb") as opened:
                 while block := opened.read(_BLOCK):

@@ -154,6 +154,19 @@ def mapping(**changes: Any) -> BagMapping:
     )
 
 
+def named(camera: str = "cam_high") -> list[Message]:
+    """The same, with topics and joints called as the robot's description calls them."""
+    old = dict(zip(JOINTS, (joint.rpartition(".")[2] for joint in joint_names()), strict=True))
+    messages = [
+        (topic.replace("/cam/image", f"/{camera}/image").replace("/leader", "/ur5e/leader"), *rest)
+        for topic, *rest in recorded()
+    ]
+    for topic, _, _, content in messages:
+        if topic.endswith("joint_states"):
+            content.name = [old[name] for name in content.name]
+    return messages
+
+
 def joint_names() -> tuple[str, ...]:
     import robots
 
@@ -342,17 +355,8 @@ def test_joints_without_a_source_strange_or_twice_are_named() -> None:
 def test_a_mapping_is_proposed_from_names_and_can_be_read_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    messages = [
-        (topic.replace("/cam/image", "/cam_high/image").replace("/leader", "/ur5e/leader"), *rest)
-        for topic, *rest in recorded()
-    ]
-    robot = mapped_robot(mapping())
-    names = [joint.rpartition(".")[2] for joint in robot.joint_names]
-    for topic, _, _, content in messages:
-        if topic.endswith("joint_states"):
-            old = dict(zip(JOINTS, names, strict=True))
-            content.name = [old[name] for name in content.name]
-    bag = written(tmp_path / "mcap", messages)  # type: ignore[arg-type]
+    robot, messages = mapped_robot(mapping()), named()
+    bag = written(tmp_path / "mcap", messages)
     with Bag(bag) as opened:
         proposed, missing = propose_mapping(opened, robot)
     assert [source.topic for source in proposed.state] == ["/ur5e/joint_states"]

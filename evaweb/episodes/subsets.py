@@ -1,0 +1,116 @@
+"""Named subsets: which episodes a query found, kept under a name, to be published as a dataset and trained on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from django.core.exceptions import ValidationError
+from django.db import IntegrityError, transaction
+from django.db.models import Count
+
+from evaweb.accounts.roles import Role, require_role
+from evaweb.blinding.visibility import Visibility
+from evaweb.core.errors import Conflict, EvaError, NotFound
+from evaweb.episodes.models import Episode, Subset
+from evaweb.episodes.selectors import episode_list
+from runtime.core.sentences import Pattern, fixed
+
+_THERE_ALREADY = Pattern(
+    "episodes.subsets.there_already", "there is a subset {name} already: choose another name"
+)
+_NONE_FOUND = fixed(
+    "episodes.subsets.none_found",
+    "no episode of these is in a dataset; allowed: at least one that was published, and whose trial is not blind",
+)
+_SEVERAL_ROBOTS = Pattern(
+    "episodes.subsets.several_robots", "the episodes are of {count} robots ({names}); allowed: of one"
+)
+_NO_SUBSET = Pattern("episodes.subsets.no_subset", "there is no subset {name!r:.120}; there are: {there}")
+_NAME = Pattern("episodes.subsets.name", "name: {why}")
+
+_NAMED = 8  # names in an error
+
+
+@transaction.atomic
+def create_subset(
+    *, user: Any, sight: Visibility, name: str, query: Mapping[str, str], description: str = ""
+) -> Subset:
+    """Keep the episodes that `query` (values of the filters of the list of episodes) finds now, under a name.
+
+    Only published episodes are kept, and none whose policy is hidden from the user.
+
+    Raises:
+        EvaError: The name is not allowed or taken, no episode is found, or they are of several robots.
+    """
+    require_role(user, Role.OPERATOR)
+    if Subset.objects.filter(name=name).exists():
+        raise Conflict(_THERE_ALREADY(name=name))
+    rows = [row for row in _publishable(query, sight) if not sight.hides_episode(row)]
+    if not rows:
+        raise EvaError(_NONE_FOUND)
+    robots = sorted({row.robot for row in rows})
+    if len(robots) > 1:
+        raise EvaError(_SEVERAL_ROBOTS(count=len(robots), names=", ".join(robots[:_NAMED])))
+    subset = Subset(
+        name=name,
+        description=description,
+        query={key: value for key, value in query.items() if value},
+        digest=_digest(str(row.uuid) for row in rows),
+        created_by=user,
+    )
+    try:
+        subset.full_clean()
+        subset.save()
+    except ValidationError as error:
+        raise EvaError(_NAME(why=" ".join(error.messages))) from None
+    except IntegrityError:
+        raise Conflict(_THERE_ALREADY(name=name)) from None
+    subset.episodes.set(rows)
+    return subset
+
+
+def _publishable(query: Mapping[str, str], sight: Visibility) -> Any:
+    return episode_list(**query, sight=sight).exclude(dataset_index=None)
+
+
+def _digest(uuids: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(sorted(uuids)).encode()).hexdigest()
+
+
+def subset_get(*, name: str) -> Subset:
+    """Return the subset of that name. Raises: NotFound, which lists the existing ones."""
+    subset = Subset.objects.filter(name=name).first()
+    if subset is None:
+        names = list(Subset.objects.values_list("name", flat=True)[: _NAMED + 1])
+        there = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+        raise NotFound(_NO_SUBSET(name=name, there=there or "none"))
+    return subset
+
+
+def subset_list(*, sight: Visibility) -> list[Subset]:
+    """Return the subsets, newest first, with the number of their episodes as `n_episodes`.
+
+    Left out are those whose name, description or query names a hidden checkpoint.
+    """
+    rows = Subset.objects.select_related("created_by").annotate(n_episodes=Count("episodes"))
+    rows = rows.order_by("-created_at", "-pk")
+    return [row for row in rows if not _names_hidden(row, sight)]
+
+
+def _names_hidden(subset: Subset, visibility: Visibility) -> bool:
+    return any(
+        visibility.named_in(text) for text in (subset.name, subset.description, *subset.query.values())
+    )
+
+
+def subset_datasets(*, subset: Subset) -> list[str]:
+    """Return the names of the datasets that have episodes of a subset now, sorted."""
+    return sorted(set(subset.episodes.exclude(dataset_index=None).values_list("dataset", flat=True)))
+
+
+def subset_uuids(*, subset: Subset) -> list[str]:
+    """Return the UUIDs of the episodes of a subset in the order in which they were recorded."""
+    rows = Episode.objects.filter(subsets=subset).order_by("started_at", "uuid")
+    return [str(uuid) for uuid in rows.values_list("uuid", flat=True)]
