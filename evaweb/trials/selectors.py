@@ -125,8 +125,8 @@ def checkpoint_list(
 def _checkpoints(visibility: Visibility) -> QuerySet[Checkpoint]:
     """Return the visible checkpoints, each without a hidden parent."""
     rows: QuerySet[Checkpoint] = visibility.filter_visible(Checkpoint.objects.all(), "pk")
-    return rows.select_related("training_set").prefetch_related(
-        Prefetch("parent", queryset=visibility.filter_visible(Checkpoint.objects.all(), "pk"))
+    return rows.prefetch_related(
+        "training_set", Prefetch("parent", queryset=visibility.filter_visible(Checkpoint.objects.all(), "pk"))
     )
 
 
