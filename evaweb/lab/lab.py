@@ -99,7 +99,7 @@ def open_lab(
             "PYTHONUNBUFFERED": "1",
         }
         processes = ChildProcesses(settings.BASE_DIR, settings.DATA_DIR / "logs", environment)
-        with open_listener(host, stop_port) as listener:
+        with open_listener(host, stop_port, "--stop-port") as listener:
             try:
                 yield Lab(processes, host, port, listener, reporter)
             finally:

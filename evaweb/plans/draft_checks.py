@@ -14,10 +14,13 @@ from evaweb.plans.design import check_drafted, planned
 from evaweb.plans.models import Allocation, Comparing, CountsAs, Plan, PrimaryOutcome, StoppingRule
 from evaweb.plans.schedule import Condition, check_schedule
 from evaweb.statistics.difference import barnard
+from evaweb.statistics.planning import approximate_power
 from evaweb.trials.models import Milestone, Scene
 from evaweb.trials.tables import TRUTHS, check_strategy
 
 _ENOUGH = 20  # pairs that, if all are won by one checkpoint, are significant at any alpha allowed
+_GAIN = (0.5, 0.7)  # success rates whose difference a plan should find
+_LIKELY = 0.5  # power below which a plan probably decides nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +157,22 @@ def _finds_nothing(plan: Plan) -> str:
     )
 
 
+def _finds_little(plan: Plan) -> str:
+    """Return a message if the plan would probably miss even a gain of _GAIN, else ""."""
+    n, comparisons = plan.positions.count() * plan.repetitions, len(planned(plan))
+    if not comparisons or not n or plan.margin is not None or plan.outcome != PrimaryOutcome.SUCCESS:
+        return ""
+    power = approximate_power(n, *_GAIN, plan.alpha / comparisons)
+    if power >= _LIKELY:
+        return ""
+    low, high = _GAIN
+    return (
+        f"{n} trials of each checkpoint probably decide nothing: success in {100 * high:.0f} instead of "
+        f"{100 * low:.0f} of 100 trials is found in about {100 * power:.0f} of 100 such evaluations, more with more "
+        "trials at each position."
+    )
+
+
 def thoughts(plan: Plan) -> Iterator[Remark]:
     """Yield remarks on allowed choices that a reader of the result may question."""
     if not plan.question.strip():
@@ -181,7 +200,7 @@ def thoughts(plan: Plan) -> Iterator[Remark]:
         yield Remark("conditions", "Only one position: the result says nothing about any other.")
     for station in plan.stations.filter(active=False):
         yield Remark("conditions", f"Station {station} is switched off.")
-    if few := _finds_nothing(plan):
+    if few := _finds_nothing(plan) or _finds_little(plan):
         yield Remark("design", few)
     odd = Milestone.objects.filter(scene__positions__plan=plan).exclude(truth__in=("", *TRUTHS)).distinct()
     for milestone in odd:

@@ -13,10 +13,10 @@ class PortInUseError(EvaError):
     """Error if it is impossible to listen on the address, usually because the port is in use."""
 
 
-def open_listener(host: str, port: int) -> socket.socket:
+def open_listener(host: str, port: int, option: str = "--port") -> socket.socket:
     """Return a non-blocking listening TCP socket; port 0 picks a free port.
 
-    Raises: PortInUseError with advice.
+    Raises: PortInUseError with advice, which names the `option` of the port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
@@ -27,7 +27,8 @@ def open_listener(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise PortInUseError(
-            f"cannot listen on {host}:{port}: {error.strerror}; name another address or port with --host, --port"
+            f"cannot listen on {host}:{port}: {error.strerror}; name another address with --host, or another port "
+            f"with {option}"
         ) from None
     listener.setblocking(False)
     return listener

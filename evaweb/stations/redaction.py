@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from evaweb.blinding.visibility import COVERED, COVERED_AT_REST, Visibility
+from evaweb.blinding.visibility import COVERED, COVERED_AT_REST, HIDDEN, Visibility
 from runtime.core.sentences import Sentence, from_wire, identity, shows, texts
 from runtime.ipc.session_state import SessionState
 
@@ -65,7 +65,7 @@ _JUDGED = ("milestones", "success")  # hidden ground truth: operators score befo
 def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, Any]:
     """Return a snapshot of the same structure in which revealing values are empty, with "veiled" set to True."""
     redacted = {key: snapshot[key] for key in _SHOWN if key in snapshot}
-    covered = COVERED_AT_REST if snapshot.get("state") == SessionState.IDLE else COVERED
+    covered = _cover(str(snapshot.get("state")))
     reason = (snapshot.get("sentences") or {}).get("reason")
     redacted["reason"] = _reason(snapshot.get("reason"), reason, sight, covered)
     redacted |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
@@ -89,6 +89,15 @@ def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, An
         if isinstance(redacted["reason"], Sentence):
             redacted["sentences"]["reason"] = identity(redacted["reason"])
     return redacted | {"veiled": True}
+
+
+def _cover(state: str) -> Sentence:
+    """Return what is shown in place of a hidden reason for this state: what to do, if anything is to be done.
+
+    It depends on the state alone.
+    """
+    covers: Mapping[str, Sentence] = {SessionState.IDLE: COVERED_AT_REST, SessionState.READY: HIDDEN}
+    return covers.get(state, COVERED)
 
 
 def _reason(text: object, sentence: object, visibility: Visibility, covered: str) -> str:
@@ -174,11 +183,9 @@ def _event(row: Mapping[str, Any], visibility: Visibility) -> dict[str, Any] | N
         )
     elif kind == "state":  # "running -> holding: the reason"
         moved, _, tail = text.partition(": ")
-        text = (
-            f"{moved}: {visibility.redact_text(reason if reason == tail else tail, COVERED)}"
-            if tail
-            else moved
-        )
+        covered = next((_cover(state) for state in SessionState if moved.endswith(state.sentence)), COVERED)
+        shown = visibility.redact_text(reason if reason == tail else tail, covered) if tail else ""
+        text = f"{moved}: {shown}" if shown and shown != HIDDEN else moved
     elif kind in ("episode_opened", "episode_closed"):
         text = str(kind).replace("_", " ")
     elif kind not in _EVENTS:

@@ -10,13 +10,18 @@ const HINTS = {
   setup: t("page.tour.setup", "The policy answers a first time; then press Run."),
   run: t("page.tour.run", "Press Run: the policy moves the arms."),
   running: t("page.tour.running", "Press Stop once the block is on the plate."),
+  next: t("page.tour.next", "Press Next trial: the plan hands it out and sets it up."),
   score: t("page.tour.score", "Tick what was reached, then press Save score."),
+  judge: t("page.tour.judge", "Say whether it was a success, then press Save score."),
 };
 
 function hint(store) {
   if (store.lease === "free") return HINTS.free;
   if (store.lease !== "mine") return "";
-  const step = currentStep(document.getElementById("steps").dataset, store.snapshot);
+  const steps = document.getElementById("steps");
+  const step = currentStep(steps.dataset, store.snapshot);
+  if (step === "choose" && steps.querySelector("[data-next]")) return HINTS.next;
+  if (step === "score" && !steps.querySelector("[data-step=score] input[type=checkbox]")) return HINTS.judge;
   return HINTS[store.snapshot?.state_is?.run_open ? "running" : step] ?? "";
 }
 

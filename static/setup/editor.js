@@ -7,6 +7,7 @@ import { Positions } from "./positions.js";
 import { t } from "../site/sentences.js";
 
 const PREVIEW_MS = 600;
+const SAVED = "eva-saved"; // key of the address of a scene that was saved before its page was opened
 const SAVE_MS = 30000; // generous [ms], because an unknown outcome is worse than a long wait
 
 class Editor {
@@ -18,6 +19,7 @@ class Editor {
   #key = `eva-draft:${location.pathname}${location.search}`;
   #saved;
   #timer = 0;
+  #shown = []; // what was wrong at the last attempt to save
 
   constructor() {
     const { scene, seen, kept, references, bench, stations, addresses } = this.#given;
@@ -31,6 +33,8 @@ class Editor {
     this.milestones = new MilestoneList(this, changed);
     this.#fill();
     if (draft) this.#tell(t("page.scene.restored", "Your unsaved changes are restored."), "pressed");
+    if (sessionStorage.getItem(SAVED) === location.pathname) this.#tell(t("page.scene.saved", "Saved."), "accepted");
+    sessionStorage.removeItem(SAVED);
     document.getElementById("discard").addEventListener("click", () => this.#discard());
     this.#form.addEventListener("input", (event) => this.#typed(event.target));
     this.#save?.addEventListener("click", () => this.#sent());
@@ -68,6 +72,8 @@ class Editor {
   }
 
   #changed() {
+    const cured = `positions.${this.positions.index}.`;
+    if (this.#shown.some(({ place }) => place.startsWith(cured))) this.#show(this.#shown.filter(({ place }) => !place.startsWith(cured)));
     sessionStorage.setItem(this.#key, JSON.stringify({ scene: this.scene, seen: this.seen }));
     this.#mark();
     clearTimeout(this.#timer);
@@ -107,6 +113,7 @@ class Editor {
       const { address, remarks, scene, seen, kept } = await post(location.pathname, { scene: this.scene, seen: this.seen }, { timeout: SAVE_MS });
       sessionStorage.removeItem(this.#key);
       if (address !== location.pathname) {
+        sessionStorage.setItem(SAVED, address);
         location.assign(address);
         return;
       }
@@ -141,6 +148,8 @@ class Editor {
 
   /** List what is wrong, with a button that leads to each place, and mark the fields. */
   #show(faults) {
+    this.#shown = faults;
+    this.positions.mark(faults.map(({ place }) => place.split(".")).filter(([kind]) => kind === "positions").map(([, index]) => Number(index)));
     for (const field of this.#form.querySelectorAll("[aria-invalid]")) field.removeAttribute("aria-invalid");
     this.#faults.replaceChildren(
       ...faults.map(({ place, text }) => {
@@ -165,7 +174,9 @@ class Editor {
   #field(place) {
     const [kind, index, name] = place.split(".");
     if (kind === "milestones" && index) return document.querySelector(`#milestone-rows > :nth-child(${Number(index) + 1}) [data-milestone=${name ?? "text"}]`);
-    if (kind === "positions") return Number(index) === this.positions.index ? document.querySelector(`[data-position=${name === "description" ? name : "label"}]`) : null;
+    if (kind === "positions" && Number(index) !== this.positions.index) return null;
+    if (kind === "positions" && name === "bench") return document.querySelector("#things input");
+    if (kind === "positions") return document.querySelector(`[data-position=${name === "description" ? name : "label"}]`);
     return this.#form.querySelector(`[data-of="${CSS.escape(kind)}"]`);
   }
 

@@ -18,6 +18,7 @@ export class Positions {
   #overlay;
   #stage;
   #view; // view box of the thumbnails
+  #wrong = []; // indices of positions that cannot be saved
   #generator;
   #part = (id) => document.getElementById(id);
 
@@ -54,6 +55,12 @@ export class Positions {
 
   get #still() {
     return !this.#may || Boolean(this.kept[this.#one?.id]);
+  }
+
+  /** Mark the thumbnails of positions that cannot be saved as they are. */
+  mark(wrong) {
+    this.#wrong = wrong;
+    this.#thumbnails();
   }
 
   choose(index) {
@@ -96,7 +103,7 @@ export class Positions {
     list.innerHTML = this.#all
       .map(({ id, number, label, bench }, index) => {
         const name = `${t("page.positions.position", "Position {n}", { n: number })}${label ? ` · ${label}` : ""}`;
-        return `<li><button type="button" class="position-pick" data-index="${index}"${index === this.index ? ' aria-current="true"' : ""}>${thumbnail(bench, this.#bench, view, "", this.#references[id]?.[0].picture)}<span class="clip">${escaped(name)}</span></button></li>`;
+        return `<li><button type="button" class="position-pick" data-index="${index}"${this.#wrong.includes(index) ? " data-wrong" : ""}${index === this.index ? ' aria-current="true"' : ""}>${thumbnail(bench, this.#bench, view, "", this.#references[id]?.[0].picture)}<span class="clip">${escaped(name)}</span></button></li>`;
       })
       .join("");
     if (focused) list.querySelector("[aria-current]")?.focus();

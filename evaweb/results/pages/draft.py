@@ -127,7 +127,8 @@ def _steps(
             label = f"{n} to fix" if n else f"{len(considered)} to consider"
             return not inway and not considered, label
         if name == "freeze":
-            return False, "ready to freeze" if not inway and not faults and agreed else "not yet"
+            ready = "ready to freeze" if planned(plan) else "ready, but compares nothing"
+            return False, ready if not inway and not faults and agreed else "not yet"
         return True, ""
 
     rows = []
@@ -179,6 +180,21 @@ def _summary(
         if plan.blind
         else "no: everybody sees which checkpoint runs",
     )
+
+
+def planned_facts(plan: Plan) -> dict[str, Any]:
+    """Return what a frozen plan was to do: its positions by scene, its trials, and its design ("" without one)."""
+    rows = list(plan.positions.order_by("scene__title", "number").values_list("scene__title", "number"))
+    each = len(rows) * plan.repetitions
+    return {
+        "each": each,
+        "total": each * plan.checkpoints.count(),
+        "scenes": [
+            (title, ", ".join(str(number) for _, number in group))
+            for title, group in groupby(rows, key=lambda row: row[0])
+        ],
+        "design": f"{design_text(plan.stopping)}, alpha {plan.alpha:g}" if planned(plan) else "",
+    }
 
 
 def _preview(plan: Plan, size: Size) -> dict[str, Any]:

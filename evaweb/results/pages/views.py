@@ -25,6 +25,7 @@ from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis.simulated import compare_with_real, is_simulated, simulated_plans
 from evaweb.results.pages import pages
+from evaweb.results.pages.draft import planned_facts
 from evaweb.results.presentation import listings
 from evaweb.results.presentation.citation import HEAD, Citation, citation
 from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_text
@@ -325,6 +326,7 @@ def _common(request: HttpRequest, plan: Plan) -> dict[str, Any]:
         "may_manage": managed,
         "voids": open_void_requests(Trial.objects.filter(handout__plan=plan)),
         "judges_ready": judges_ready() if managed and has_results(plan) else [],
+        "planned": planned_facts(plan),
         "here": "plans",
         "home": reverse("result-plan", args=[plan.name, plan.version]),
     }

@@ -71,7 +71,8 @@ def test_a_taken_port_is_an_error_that_names_the_option():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(
-            PortInUseError, match=rf"cannot listen on 127.0.0.1:{port}: .* with --host, --port"
+            PortInUseError,
+            match=rf"cannot listen on 127.0.0.1:{port}: .* with --host, or another port with --port",
         ):
             open_listener("127.0.0.1", port)
 

@@ -169,3 +169,28 @@ def test_neither_numbers_nor_gaps_in_them_count_the_events_that_are_left_out():
         for newest in (3, 8)
     ]
     assert states[0] == states[1]
+
+
+@pytest.mark.parametrize(
+    ("before", "state", "shown"),
+    [
+        ("setting_up", "ready", "setting_up -> ready"),
+        (
+            "setting_up",
+            "idle",
+            "setting_up -> idle: hidden until the reveal: set up again; if that fails again, ",
+        ),
+        (
+            "running",
+            "holding",
+            "running -> holding: hidden until the reveal: check whether the robot stands safely",
+        ),
+    ],
+)
+def test_what_stands_for_a_hidden_reason_asks_for_nothing_where_nothing_is_to_be_done(before, state, shown):
+    row = {"number": 1, "kind": "state", "text": f"{before} -> {state}: {plain(LOST)}", "data": {}}
+    (event,) = redaction.redact_events([row], FULL_VISIBILITY)
+    assert event["text"].startswith(shown)
+    assert (event["text"] == shown) is (state == "ready")
+    snapshot = redaction.redact_state({"state": state, "reason": LOST}, FULL_VISIBILITY)
+    assert (plain(snapshot["reason"]) == "hidden until the reveal") is (state == "ready")
