@@ -63,8 +63,8 @@ def subset_list(request: HttpRequest) -> Any:
     return [_out(request, row) for row in rows]
 
 
-@router.post("", response={201: SubsetOut, **FAILURES}, summary="Keep a subset", url_name="subsets")
-def keep_subset(request: HttpRequest, given: SubsetIn) -> Any:
+@router.post("", response={201: SubsetOut, **FAILURES}, summary="Save a subset", url_name="subsets")
+def save_subset(request: HttpRequest, given: SubsetIn) -> Any:
     """Keep the published episodes that the query finds now, under a name. They are published by a job of datasets."""
     visibility = visibility_for_request(request)
     subset = subsets.create_subset(

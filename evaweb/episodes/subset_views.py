@@ -31,7 +31,7 @@ def subsets(request: HttpRequest) -> HttpResponseBase:
 
 
 @require_POST
-def keep_subset(request: HttpRequest) -> HttpResponseBase:
+def save_subset(request: HttpRequest) -> HttpResponseBase:
     """Keep the episodes that the filters of the form find, under its name."""
     visibility = visibility_for_request(request)
     listing = Listing(request.POST, (), listed.filters(visibility))
@@ -49,5 +49,5 @@ def keep_subset(request: HttpRequest) -> HttpResponseBase:
         messages.error(request, str(error))
         chosen = {key: value for key, value in listing.chosen.items() if value}
         return redirect(f"{reverse('replay-list')}?{urlencode(chosen)}")
-    messages.success(request, f"{subset.name}: {subset.episodes.count()} episodes kept")
+    messages.success(request, f"{subset.name}: {subset.episodes.count()} episodes saved")
     return redirect("subset-list")

@@ -146,12 +146,12 @@ def test_pages_and_rest_keep_show_and_publish(
 ) -> None:
     client.force_login(ann)
     listed = client.get(reverse("replay-list") + "?status=finished").content.decode()
-    assert "Keep as a subset" in listed
+    assert "Save as a subset" in listed
     form = {"name": "mine", "description": "for pi0", "status": "finished"}
-    page = client.post(reverse("subset-keep"), form, follow=True).content.decode()
-    assert "mine: 3 episodes kept" in page
+    page = client.post(reverse("subset-save"), form, follow=True).content.decode()
+    assert "mine: 3 episodes saved" in page
     assert "status: finished" in page
-    refused = client.post(reverse("subset-keep"), form, follow=True)
+    refused = client.post(reverse("subset-save"), form, follow=True)
     assert "already" in refused.content.decode()
     assert refused.redirect_chain[-1][0].endswith("?status=finished")
 
