@@ -44,7 +44,7 @@ def _size(thing: Box | Disc) -> dict[str, Any]:
 # The simulated bench, with lengths in m, and position and reach of its arms.
 SIZES = {
     "area": BENCH.area,
-    "apart": [[*pair.objects, pair.distance] for pair in BENCH.apart],
+    "apart": BENCH.distances,
     "sides": BENCH.reach.sides,
     "reach": BENCH.reach.distance,
     "objects": {name: _size(thing) for name, thing in BENCH.objects.items()},

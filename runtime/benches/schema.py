@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -30,6 +31,8 @@ class _Placed(Settings):
     colour: Colour
     example: Annotated[list[float], Field(min_length=2, max_length=3)]
     """Place in a new position: the numbers of `numbers`."""
+    area: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    """Where a reset lays it out at random; None: in the area of the bench."""
 
 
 class Box(_Placed):
@@ -60,10 +63,21 @@ class Disc(_Placed):
 
 
 class Apart(Settings):
-    """Least distance of two objects, centre to centre [m]."""
+    """Least distance between each two of `objects`, or between each of `objects` and each of `others` [m].
 
-    objects: Annotated[list[Name], Field(min_length=2, max_length=2)]
+    Distances are from centre to centre.
+    """
+
+    objects: Annotated[list[Name], Field(min_length=1)]
+    others: list[Name] = Field(default_factory=list)
     distance: Length
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Pairs of objects that have this least distance."""
+        if self.others:
+            return [(one, other) for one in self.objects for other in self.others]
+        return list(itertools.combinations(self.objects, 2))
 
 
 class Reach(Settings):
@@ -80,6 +94,23 @@ class Distractors(Settings):
     distance: Length = 0.1
 
 
+class Milestone(Settings):
+    """What the bench reports of an object."""
+
+    text: Annotated[str, Field(min_length=1, max_length=120)]
+    """What people read."""
+    when: Literal["held", "lifted", "above", "rests"]
+    """In a gripper; in one and clear of the table; the same above a disc; or at rest on a disc, released."""
+    object: Name
+    on: str = ""
+    """Disc, for `above` and `rests`."""
+
+    @property
+    def passes(self) -> bool:
+        """Whether it stays reached once it was; `rests` is true only while the object rests there."""
+        return self.when != "rests"
+
+
 class BenchSchema(Settings):
     """What a bench consists of, and which layouts it accepts."""
 
@@ -91,7 +122,11 @@ class BenchSchema(Settings):
     objects: Annotated[dict[Name, Annotated[Box | Disc, Field(discriminator="shape")]], Field(min_length=1)]
     apart: list[Apart] = Field(default_factory=list)
     distractors: Distractors = Distractors()
-    milestones: dict[Name, str]
+    together: list[Annotated[list[Name], Field(min_length=2)]] = Field(default_factory=list)
+    """Objects that are placed so that one arm reaches all of them."""
+    milestones: Annotated[dict[Name, Milestone], Field(min_length=1)]
+    success: Annotated[list[Name], Field(min_length=1)]
+    """Milestones of the kind `rests` that together are the success of the task."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> BenchSchema:
@@ -104,13 +139,48 @@ class BenchSchema(Settings):
             raise SetupError(
                 "objects.objects: this name is that of objects laid out by people; allowed: another"
             )
+        self._require_milestones()
+        for names in self.together:
+            if strangers := [name for name in names if name not in self.objects]:
+                raise SetupError(f"together = {strangers}; allowed: names of {', '.join(self.objects)}")
         for pair in self.apart:
-            strangers = [name for name in pair.objects if name not in self.objects]
-            if strangers or pair.objects[0] == pair.objects[1]:
-                raise SetupError(f"apart.objects = {pair.objects}; allowed: two of {', '.join(self.objects)}")
+            named = [*pair.objects, *pair.others]
+            if not pair.pairs or len(set(named)) < len(named) or not set(named) <= set(self.objects):
+                raise SetupError(
+                    f"apart.objects = {pair.objects}, others = {pair.others}; allowed: two or more of "
+                    f"{', '.join(self.objects)}, each once"
+                )
         if problem := next(self.problems({name: thing.example for name, thing in self.objects.items()}), ""):
             raise SetupError(f"the examples are no layout: {problem}")
         return self
+
+    def _require_milestones(self) -> None:
+        for name, milestone in self.milestones.items():
+            on_disc = milestone.when in ("above", "rests")
+            fits = milestone.on in self.discs if on_disc else not milestone.on
+            if milestone.object not in self.boxes or not fits:
+                raise SetupError(
+                    f"milestones.{name}: object = {milestone.object!r}, on = {milestone.on!r}; allowed: object one of "
+                    f"{', '.join(self.boxes)}; on "
+                    + (
+                        f"one of {', '.join(self.discs) or 'no disc'}"
+                        if on_disc
+                        else f"none if when = {milestone.when!r}"
+                    )
+                )
+        resting = [name for name, milestone in self.milestones.items() if milestone.when == "rests"]
+        if strangers := [name for name in self.success if name not in resting]:
+            raise SetupError(f"success = {strangers}; allowed: {', '.join(resting) or 'no milestone rests'}")
+
+    @property
+    def boxes(self) -> dict[str, Box]:
+        """Boxes by name, in the order of the file."""
+        return {name: thing for name, thing in self.objects.items() if isinstance(thing, Box)}
+
+    @property
+    def discs(self) -> dict[str, Disc]:
+        """Discs by name, in the order of the file."""
+        return {name: thing for name, thing in self.objects.items() if isinstance(thing, Disc)}
 
     def box(self, name: str) -> Box:
         """Return the box of that name. Raises: SetupError if there is none."""
@@ -128,7 +198,12 @@ class BenchSchema(Settings):
 
     def distance(self, one: str, other: str) -> float:
         """Return the least distance of two objects [m], 0 if none is declared."""
-        return next((pair.distance for pair in self.apart if {one, other} == set(pair.objects)), 0.0)
+        return next((least for *pair, least in self.distances if {one, other} == set(pair)), 0.0)
+
+    @property
+    def distances(self) -> list[tuple[str, str, float]]:
+        """Pairs of objects with their least distances [m]."""
+        return [(*names, pair.distance) for pair in self.apart for names in pair.pairs]
 
     def problems(self, layout: Mapping[str, Any]) -> Iterator[str]:
         """Yield a sentence for each place of `layout` (name -> numbers) that the bench does not accept.
@@ -142,15 +217,11 @@ class BenchSchema(Settings):
                 yield problem
             else:
                 placed[name] = place
-        for pair in self.apart:
-            one, other = pair.objects
+        for one, other, least in self.distances:
             if one in placed and other in placed:
                 apart = math.dist(placed[one][:2], placed[other][:2])
-                if apart < pair.distance:
-                    yield (
-                        f"{one} and {other} are {1000 * apart:.0f} mm apart; allowed: "
-                        f"{1000 * pair.distance:.0f} mm or more"
-                    )
+                if apart < least:
+                    yield f"{one} and {other} are {1000 * apart:.0f} mm apart; allowed: {1000 * least:.0f} mm or more"
 
     def _place_problem(self, name: str, place: Any) -> str:
         thing = self.objects.get(name)

@@ -1,4 +1,4 @@
-"""Environments of a simulated node: test patterns, or a bench with blocks and a plate, a belt, or contact forces."""
+"""Environments of a simulated node: test patterns, or a bench with objects, with a belt, or with contact forces."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from runtime.benches.schema import load_schema
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64, UInt8
+from runtime.simulation.bench.bench import Bench
 from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.conveyor import Conveyor
 from runtime.simulation.bench.numbered_frames import Scene
@@ -19,7 +21,12 @@ from runtime.simulation.bench.tabletop import Tabletop
 if TYPE_CHECKING:
     from robots import Robot
 
-NAMES = ("none", "tabletop", "conveyor", "contact")
+OWN = (
+    "none",
+    "tabletop",
+    "conveyor",
+    "contact",
+)  # other values are benches by name, or paths of their folders
 
 
 class Environment(ABC):
@@ -95,7 +102,7 @@ class BenchEnvironment(Environment):
         They are drawn only if something has moved, because drawing is most of the work.
         """
         state = self._tabletop.state()
-        moment = np.concatenate([q, state.plate, *(block.pose.ravel() for block in state.blocks)]).tobytes()
+        moment = np.concatenate([q, *state.discs, *(block.pose.ravel() for block in state.blocks)]).tobytes()
         if moment != self._drawn[0]:
             self._drawn = moment, self._renderer.draw(q, state)
             for picture in self._drawn[1].values():
@@ -114,9 +121,12 @@ class BenchEnvironment(Environment):
 def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
     """Return the environment that `options.bench` names.
 
+    "contact" is the tabletop with contact forces; benches by name or path have contact forces.
+
     Raises:
-        SetupError: If --blocks is not 1 with a conveyor, or the contact physics is not installed.
-        BenchError: If the blocks do not fit on the tabletop.
+        SetupError: If --blocks is not 1 with a conveyor, there is no such bench, or the contact physics is not
+            installed.
+        BenchError: If the blocks do not fit on the bench.
     """
     if options.bench == "conveyor":
         if options.blocks != 1:
@@ -126,8 +136,9 @@ def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
         return BenchEnvironment(robot, options, Conveyor(robot, options.seed))
     if options.bench == "tabletop":
         return BenchEnvironment(robot, options, Tabletop(robot, options.seed, options.blocks))
-    if options.bench == "contact":
-        from runtime.simulation.contact.bench import ContactTabletop  # no other environment needs its modules
+    if options.bench == "none":
+        return TestPatternEnvironment(robot, options)
+    from runtime.simulation.contact.bench import ContactTabletop  # no other environment needs its modules
 
-        return BenchEnvironment(robot, options, ContactTabletop(robot, options.seed, options.blocks))
-    return TestPatternEnvironment(robot, options)
+    table = Bench(load_schema("tabletop" if options.bench == "contact" else options.bench))
+    return BenchEnvironment(robot, options, ContactTabletop(robot, options.seed, options.blocks, table))

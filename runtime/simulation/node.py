@@ -3,9 +3,9 @@
 Each tick executes the newest command, moves the plant and publishes one observation. Beyond the plain protocol an
 observation contains the frame number (`seq`), colour order (`encoding`), current master (`master`), number of the
 master's last message that took effect (`ack`), refused messages by reason (`refused`), whether the robot is `holding`
-because it receives no commands, and the state of its `drives`. With `--bench tabletop`, `contact` (the
-same with contact forces) or `conveyor` there are objects; the word "scene_reset" resets them, and the field `truth` is
-their ground truth.
+because it receives no commands, and the state of its `drives`. With `--bench tabletop`, `contact` (the same with
+contact forces), `conveyor`, or another bench by name or path there are objects; the word "scene_reset" resets them, and
+the field `truth` is their ground truth.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from robots.broken_pipe import exit_on_broken_pipe
+from runtime.benches.schema import installed_benches
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault, SetupError
@@ -231,7 +232,10 @@ def parser() -> argparse.ArgumentParser:
         "--seed", type=int, default=0, help="grain of the pictures, gestures of the leader, first layout"
     )
     line.add_argument(
-        "--bench", choices=environments.NAMES, default="none", help="what there is to touch (default: none)"
+        "--bench",
+        default="none",
+        help=f"what there is to touch: {', '.join(environments.OWN)} (default: none), or with contact forces "
+        f"{', '.join(installed_benches())}, or the path of a bench's folder",
     )
     line.add_argument("--blocks", type=int, default=1, help="on the tabletop; the first is the task's")
     line.add_argument("--start-pose", metavar="NAME", default="home", help="a pose of the robot")

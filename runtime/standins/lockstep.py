@@ -69,7 +69,7 @@ def in_process_peers(
         SetupError: If the deployment does not declare a simulated node with a bench.
     """
     transport = made.deployment.transport
-    if not made.capabilities.resets_bench or transport.kind != "zmq":
+    if not made.capabilities.bench or transport.kind != "zmq":
         raise SetupError(
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
@@ -93,7 +93,8 @@ def station(
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
     spec = check_deployment(loader.load(path, assignments))
-    arguments = ("--robot", spec.robot.name, "--bench", "contact", *bench_options)  # the last --bench counts
+    bench = "contact" if spec.capabilities.bench == "tabletop" else spec.capabilities.bench or "none"
+    arguments = ("--robot", spec.robot.name, "--bench", bench, *bench_options)  # the last --bench counts
     options = node_parser().parse_args(arguments)
     around = environments.make_environment(spec.robot, options)
     peers = in_process_peers(spec, clock, around, options)
@@ -111,9 +112,8 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument("--seed", type=int, default=0, help="the first layout of the bench")
     line.add_argument(
         "--bench",
-        choices=("contact", "tabletop"),
-        default="contact",
-        help="how blocks move: by contact forces, or by rules (default: contact)",
+        help="tabletop: block and plate that move by rules; without it, the bench of the deployment's transport, with "
+        "contact forces",
     )
     line.add_argument(
         "--serve",
@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 server = stack.enter_context(closing(serve.build_server(server_options, clock)))
                 urls[str(server_options.name or len(urls))] = str(server.start()["url"])
             own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
-            bench = ("--bench", options.bench, "--seed", options.seed)
+            bench = (*(("--bench", options.bench) if options.bench else ()), "--seed", options.seed)
             size = ("--width", options.width, "--height", options.height)
             served = station(
                 options.deployment,

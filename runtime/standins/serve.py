@@ -47,10 +47,17 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument(
         "--latency-ms", "--delay-ms", type=float, default=0.0, help="time that an inference takes"
     )
-    line.add_argument("--behaviour", choices=["gesture", "pick_place", "chase"], default="gesture")
+    line.add_argument("--behaviour", choices=["gesture", "pick_place", "sorting", "chase"], default="gesture")
     line.add_argument("--name", help="what the server calls its policy; the behaviour's own if not given")
-    line.add_argument("--seed", type=int, default=0, help="which gesture; the chances of pick_place")
-    skill = line.add_argument_group("how good pick_place is")
+    line.add_argument(
+        "--seed", type=int, default=0, help="which gesture; the chances of pick_place and sorting"
+    )
+    line.add_argument(
+        "--bench",
+        default="sorting",
+        help="sorting: bench with the blocks and bins, by name or path of its folder",
+    )
+    skill = line.add_argument_group("how good pick_place and sorting are")
     skill.add_argument(
         "--noise", type=_length, default=0.0, metavar="MM", help="one sigma on where it takes the block to be"
     )
@@ -248,9 +255,9 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
     from runtime.simulation.scripts.chase import ChaseScript
     from runtime.simulation.scripts.pick_place import PickPlace, Skill, poses_apart
 
-    if options.behaviour != "pick_place" and (options.noise or options.failure_rate):
+    if options.behaviour not in ("pick_place", "sorting") and (options.noise or options.failure_rate):
         raise SetupError(
-            "--noise and --failure-rate are for --behaviour pick_place; no other fails on purpose"
+            "--noise and --failure-rate are for --behaviour pick_place and sorting; no other fails on purpose"
         )
     if options.behaviour == "chase":
         return ChaseScript(robot, options.horizon, rate, options.name, clock)
@@ -258,6 +265,13 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
         return WavingScript(robot, options.horizon, rate, options.seed, options.name)
     skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)
     apart = poses_apart if options.space == "eef" else None
+    if options.behaviour == "sorting":
+        from runtime.benches.schema import load_schema
+        from runtime.simulation.bench.bench import Bench
+        from runtime.simulation.scripts.sorting import Sorting
+
+        table = Bench(load_schema(options.bench))
+        return Sorting(robot, options.horizon, rate, skill, table, options.name, clock, apart)
     return PickPlace(robot, options.horizon, rate, skill, options.name, clock, apart)
 
 

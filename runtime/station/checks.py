@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from runtime.benches.schema import load_schema
 from runtime.config import collection
 from runtime.config.loader import Resolved
 from runtime.core.errors import ConfigurationError, SetupError
@@ -33,6 +34,8 @@ def check_deployment(resolved: Resolved) -> StationSpec:
             f"recording.heights: {', '.join(strange)} are no cameras of this station; "
             f"allowed: {', '.join(spec.cameras)}"
         )
+    if spec.capabilities.bench:
+        load_schema(spec.capabilities.bench)
     if settings.cameras:
         from runtime.cameras.attach import check
 

@@ -23,7 +23,7 @@ class Capabilities:
     spaces: frozenset[str] = frozenset({"joint"})  # command spaces that it publishes; "eef" includes "joint"
     poses: tuple[PoseFormat, ...] = ()  # accepted pose formats for "eef"; empty: any
     drives_itself: bool = False  # on request its node follows its own leader and reports the actions
-    resets_bench: bool = False  # a declared simulation: resets its bench and reports its ground truth
+    bench: str = ""  # of a declared simulation, which resets this bench and reports its ground truth
 
 
 class Source(ABC):

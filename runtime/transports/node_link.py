@@ -30,6 +30,9 @@ class NodeSettings(Settings):
     """Time without a usable message after which the missing data are reported [s]."""
     simulated: bool = False
     """Whether the node is a simulated bench: the station may reset it, and accepts the ground truth that it reports."""
+    bench: str = "tabletop"
+    """Which bench it simulates: one that comes with the program, or the path of a bench's folder. Positions that the
+    station is asked to lay out have to fit it."""
 
 
 # A connection that was cut silently is dropped after 4 s and opened again; the kernel's default may be 15 min.

@@ -74,7 +74,10 @@ def capabilities(config: Config) -> Capabilities:
     It may command a real robot, send measured poses, follow its own leader and, if declared simulated, reset its bench.
     """
     return Capabilities(
-        moves_robot=True, measures_eef=True, drives_itself=True, resets_bench=config.simulated
+        moves_robot=True,
+        measures_eef=True,
+        drives_itself=True,
+        bench=config.bench if config.simulated else "",
     )
 
 

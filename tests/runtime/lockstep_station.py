@@ -53,7 +53,7 @@ class StubRobot(Source, Sink):
         self.bias: Float64 = np.zeros(DIM)  # it stands beside where it is told to go
         self.misread: Float64 = np.zeros(DIM)  # by how much its encoders are off
         self.told: list[tuple[str, dict[str, Any]]] = []
-        self.wordless = not stubs.spec.capabilities.resets_bench
+        self.wordless = not stubs.spec.capabilities.bench
         self.deaf = 0  # control words that are lost on their way to it
         self.truth: dict[str, Any] | None = None
         self.drives: dict[str, Any] | None = None
@@ -195,7 +195,7 @@ def stubbed(
     }
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
-    can = Capabilities(moves_robot=moves_robot, resets_bench=simulated)
+    can = Capabilities(moves_robot=moves_robot, bench="tabletop" if simulated else "")
     spec = replace(check_deployment(loader.resolve_deployment(tree, {}, "test")), capabilities=can)
     return Stubs(spec, start, rows, space, absent, real)
 

@@ -24,7 +24,7 @@ def written(folder: Path, *changes: tuple[str, str]) -> str:
 
 
 def test_every_bench_that_comes_with_the_program_can_be_read_and_accepts_its_examples() -> None:
-    assert installed_benches() == ["tabletop"]
+    assert installed_benches() == ["sorting", "tabletop"]
     for name in installed_benches():
         schema = load_schema(name)
         assert list(schema.problems({key: thing.example for key, thing in schema.objects.items()})) == []
@@ -68,8 +68,20 @@ def test_what_a_layout_may_ask_for_is_said_by_the_schema(layout: dict, problems:
         ("radius = 0.075", "", "objects.plate.radius is missing"),
         ("rim_colour = [58, 104, 190]", "rim_colour = [58, 104, 300]", "objects.plate.rim_colour.2 = 300"),
         ("area = [-0.22, 0.22", "area = [0.22, -0.22", "each range increasing"),
-        ('objects = ["block", "plate"]', 'objects = ["block", "cup"]', "allowed: two of plate, block"),
+        (
+            'objects = ["block", "plate"]',
+            'objects = ["block", "cup"]',
+            "allowed: two or more of plate, block, each once",
+        ),
         ("example = [0.1, 0.32]", "example = [0.5, 0.32]", "the examples are no layout: plate at x 500"),
+        (
+            'on = "plate"',
+            'on = "block"',
+            "milestones.over_plate: object = 'block', on = 'block'; allowed: object one of block",
+        ),
+        ('when = "held"', 'when = "above"', "on one of plate"),
+        ('success = ["placed"]', 'success = ["lifted"]', "success = ['lifted']; allowed: placed"),
+        ('together = [["block", "plate"]]', 'together = [["block", "cup"]]', "together = ['cup']"),
         ('title = "Block on plate"', 'title = "x" extra', "bench.toml"),
         ('title = "Block on plate"', "tilte = 1", "tilte = 1: unknown key (did you mean title?)"),
     ],

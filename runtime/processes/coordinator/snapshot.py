@@ -47,7 +47,7 @@ def _snapshot(of: Components, inbox: Inbox) -> dict[str, Any]:
         "drives": dict(reception.drives),
         "collect": of.collecting.status(),
         "task": settings.task,
-        "simulated": spec.capabilities.resets_bench,
+        "simulated": bool(spec.capabilities.bench),
         "truth": dict(reception.truth),
         "transport": settings.transport.kind,
         "policy": {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.benches.schema import load_schema
+from runtime.benches.schema import BenchSchema, Box, Disc, load_schema
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64
 from runtime.simulation.bench.arm_frames import arm_frames
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 Colour = tuple[int, int, int]
 
 TABLETOP = load_schema("tabletop")
-_BLOCK, _PLATE = TABLETOP.box("block"), TABLETOP.disc("plate")
 _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
 _OVERHEAD_FOCAL = 1.0  # focal length in image widths
 _WRIST_FOCAL = 0.75
@@ -34,12 +33,6 @@ _WRIST_FOCAL = 0.75
 def _colour(parts: Sequence[int]) -> Colour:
     red, green, blue = parts
     return red, green, blue
-
-
-_AREA = tuple(TABLETOP.area)
-_TABLE_COLOUR = _colour(TABLETOP.table_colour)
-_PLATE_COLOUR, _RIM_COLOUR = _colour(_PLATE.colour), _colour(_PLATE.rim_colour)
-_BLOCK_COLOURS = tuple(map(_colour, (_BLOCK.colour, *TABLETOP.distractors.colours)))
 
 
 class BenchError(RuntimeFault):
@@ -63,30 +56,72 @@ class Belt:
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
-    """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table, by default the tabletop's.
+class DiscShape:
+    """Disc: its sizes [m] and colours (red, green, blue; 0 to 255)."""
 
-    `area` bounds the places of objects: lowest x, highest x, lowest y, highest y. The first block belongs to the task
-    and has the first of `block_colours`; the other blocks have the next colours in turn.
+    name: str
+    radius: float
+    height: float
+    colour: Colour
+    rim_colour: Colour
+
+
+class Bench:
+    """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table, as a schema declares them.
+
+    Blocks are the schema's boxes; further blocks are distractors, which are like the first box. `area` bounds the
+    places of objects: lowest x, highest x, lowest y, highest y.
+
+    Raises:
+        BenchError: If a box is no cube.
     """
 
-    block_edge: float = _BLOCK.size[0]
-    plate_radius: float = _PLATE.radius
-    plate_height: float = _PLATE.height
-    area: tuple[float, ...] = _AREA
-    table_colour: Colour = _TABLE_COLOUR
-    plate_colour: Colour = _PLATE_COLOUR
-    plate_rim_colour: Colour = _RIM_COLOUR
-    block_colours: tuple[Colour, ...] = _BLOCK_COLOURS
-    belt: Belt | None = None
+    def __init__(self, schema: BenchSchema = TABLETOP, belt: Belt | None = None) -> None:
+        self.schema, self.belt = schema, belt
+        self.area = tuple(schema.area)
+        self.table_colour = _colour(schema.table_colour)
+        self.block_names = tuple(schema.boxes)
+        self.discs = tuple(_disc_shape(name, disc) for name, disc in schema.discs.items())
+        self._edges = tuple(_edge(name, box) for name, box in schema.boxes.items())
+        self._colours = tuple(_colour(box.colour) for box in schema.boxes.values())
+        self._distractor_colours = tuple(map(_colour, schema.distractors.colours))
+
+    @property
+    def block_edge(self) -> float:
+        """Edge of the first block, and of distractors [m]."""
+        return self._edges[0]
+
+    def edge(self, block: int) -> float:
+        """Return the edge of the block of that number [m]."""
+        return self._edges[block] if block < len(self._edges) else self._edges[0]
+
+    def colour(self, block: int) -> Colour:
+        """Return the colour of the block of that number; distractors have those of the schema in turn."""
+        if block < len(self._colours):
+            return self._colours[block]
+        palette = (self._colours[0], *self._distractor_colours)
+        return palette[block % len(palette)]
+
+
+def _edge(name: str, box: Box) -> float:
+    if len(set(box.size)) > 1:
+        raise BenchError(f"objects.{name}.size = {box.size}; allowed on a simulated bench: a cube")
+    return box.size[0]
+
+
+def _disc_shape(name: str, disc: Disc) -> DiscShape:
+    return DiscShape(name, disc.radius, disc.height, _colour(disc.colour), _colour(disc.rim_colour))
 
 
 @dataclass(frozen=True, slots=True)
 class BenchLayout:
-    """Places of the blocks (x, y, yaw) and of the plate (x, y) after a reset; the first block belongs to the task."""
+    """Places of the blocks (x, y, yaw) and of the discs (x, y) after a reset.
+
+    They are in the order of the schema; distractors follow the schema's blocks.
+    """
 
     blocks: tuple[tuple[float, float, float], ...]
-    plate: tuple[float, float]
+    discs: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,10 +134,10 @@ class BlockState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchState:
-    """State of every movable object on the table at one moment."""
+    """State of every object on the table at one moment."""
 
     blocks: tuple[BlockState, ...]
-    plate: tuple[float, float]
+    discs: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,12 +175,12 @@ class PinholeCamera:
         return float(x), float(y)
 
 
-def block_pose(block: tuple[float, float, float], bench: Bench) -> Float64:
-    """Return the pose [4, 4] of a block that lies flat on the table at (x, y, yaw)."""
+def block_pose(block: tuple[float, float, float], edge: float) -> Float64:
+    """Return the pose [4, 4] of a block with edges of `edge` [m] that lies flat on the table at (x, y, yaw)."""
     x, y, yaw = block
     pose = np.eye(4)
     pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    pose[:3, 3] = x, y, bench.block_edge / 2
+    pose[:3, 3] = x, y, edge / 2
     return pose
 
 

@@ -1,4 +1,4 @@
-"""Blocks and a plate on the simulated bench: their layout, the milestones of the task and the ground truth.
+"""Blocks and discs on the simulated bench: their layout, the milestones of the task and the ground truth.
 
 Subclasses decide how blocks move: by rules (`tabletop.py`) or by contact forces (`runtime/simulation/contact`).
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.benches.schema import Milestone
 from runtime.simulation.bench.bench import Bench, BenchLayout, BenchState, block_pose, yaw_of
 from runtime.simulation.bench.block import Block
 from runtime.simulation.bench.layout import draw_layout
@@ -19,7 +20,7 @@ from runtime.simulation.bench.plant import Plant
 
 REST_S = 0.2  # time without motion after which a block is at rest
 LIFTED_M = 0.03  # height above the table from which a held block counts as lifted
-MARGIN_M = 0.01  # least distance of the block's centre inside the plate's rim for success
+MARGIN_M = 0.01  # least distance of a block's centre inside a disc's rim for success
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +33,13 @@ class ResetRequest:
 
 
 class BlockTable(ABC):
-    """Blocks and a plate in front of one robot; `advance` moves the robot's plant and everything that it touches."""
+    """Blocks and discs in front of one robot; `advance` moves the robot's plant and everything that it touches."""
 
     def __init__(self, seed: int, blocks: int = 1, bench: Bench | None = None) -> None:
         self.bench = bench or Bench()
         self._count = blocks
         self._blocks: list[Block] = []
-        self._plate = np.zeros(2)
+        self._discs = np.zeros((len(self.bench.discs), 2))
         self._reached: dict[str, bool] = {}
         self._reset = ResetRequest("", seed)
         self._place_objects(self._reset)
@@ -60,23 +61,29 @@ class BlockTable(ABC):
 
     def state(self) -> BenchState:
         """Return the state of everything on the table, for rendering."""
-        x, y = self._plate
-        return BenchState(tuple(block.state() for block in self._blocks), (float(x), float(y)))
+        discs = tuple((float(x), float(y)) for x, y in self._discs)
+        return BenchState(tuple(block.state() for block in self._blocks), discs)
 
     def truth(self) -> dict[str, object]:
         """Return the ground truth for the node's observation.
 
-        Its milestones are those that the first block has reached since the last reset.
+        Milestones that pass are those that were reached since the last reset. `plate` is the first disc.
         """
-        placed = self._on_plate(0.0)
+        schema = self.bench.schema
+        reached = {
+            name: self._reached[name] if milestone.passes else self._rests(milestone)
+            for name, milestone in schema.milestones.items()
+        }
+        discs = self._discs.tolist()
         return {
             "reset": self._reset.id,
             "seed": self._reset.seed,
             "blocks": [[*map(float, block.pose[:3, 3]), yaw_of(block.pose)] for block in self._blocks],
-            "plate": [float(part) for part in self._plate],
+            "plate": discs[0],
+            **({"discs": discs} if len(discs) > 1 else {}),
             "held": [block.held_by for block in self._blocks],
-            "milestones": {**self._reached, "placed": placed},
-            "success": self._on_plate(MARGIN_M),
+            "milestones": reached,
+            "success": all(self._rests(schema.milestones[name], MARGIN_M) for name in schema.success),
         }
 
     def _layout(self, wish: ResetRequest) -> BenchLayout:
@@ -85,28 +92,42 @@ class BlockTable(ABC):
         Raises:
             BenchError: If it is not possible; nothing has changed then.
         """
-        return draw_layout(wish.seed, wish.positions, self._count)
+        return draw_layout(wish.seed, wish.positions, self._count, self.bench.schema)
 
     def _place_objects(self, wish: ResetRequest) -> None:
         layout = self._layout(wish)
-        edge = self.bench.block_edge
-        self._blocks = [Block(block_pose(place, self.bench), edge) for place in layout.blocks]
-        self._plate = np.array(layout.plate)
-        self._reached = {"grasped": False, "lifted": False, "over_plate": False}
+        edges = [self.bench.edge(index) for index in range(len(layout.blocks))]
+        self._blocks = [
+            Block(block_pose(place, edge), edge) for place, edge in zip(layout.blocks, edges, strict=True)
+        ]
+        self._discs = np.array(layout.discs).reshape(-1, 2)
+        schema = self.bench.schema
+        self._reached = {name: False for name, milestone in schema.milestones.items() if milestone.passes}
 
     def _note(self) -> None:
-        """Update the milestones of the task's block."""
-        block = self._blocks[0]
+        """Update the milestones that pass."""
+        for name in self._reached:
+            self._reached[name] |= self._is_reached(self.bench.schema.milestones[name])
+
+    def _is_reached(self, milestone: Milestone) -> bool:
+        block = self._blocks[self.bench.block_names.index(milestone.object)]
+        if milestone.when == "held":
+            return bool(block.held_by)
         lifted = bool(block.held_by) and block.bottom > LIFTED_M
-        self._reached["grasped"] |= bool(block.held_by)
-        self._reached["lifted"] |= lifted
-        self._reached["over_plate"] |= lifted and self._from_plate() < self.bench.plate_radius
+        return lifted and (milestone.when == "lifted" or self._is_over(block, milestone.on))
 
-    def _from_plate(self) -> float:
-        return float(np.hypot(*(self._blocks[0].pose[:2, 3] - self._plate)))
+    def _is_over(self, block: Block, disc: str, margin: float = 0.0) -> bool:
+        """Return True if a block's centre is above a disc, `margin` [m] inside its rim."""
+        index = self._disc_index(disc)
+        distance = float(np.hypot(*(block.pose[:2, 3] - self._discs[index])))
+        return distance < self.bench.discs[index].radius - margin
 
-    def _on_plate(self, margin: float) -> bool:
-        """Return True if the task's block is at rest on the plate, `margin` [m] inside its rim."""
-        block = self._blocks[0]
-        lies = block.still >= REST_S and abs(block.bottom - self.bench.plate_height) < 1e-3
-        return lies and not block.held_by and self._from_plate() < self.bench.plate_radius - margin
+    def _disc_index(self, name: str) -> int:
+        return next(index for index, disc in enumerate(self.bench.discs) if disc.name == name)
+
+    def _rests(self, milestone: Milestone, margin: float = 0.0) -> bool:
+        """Return True if the milestone's block is at rest on its disc, `margin` [m] inside the rim."""
+        block = self._blocks[self.bench.block_names.index(milestone.object)]
+        height = self.bench.discs[self._disc_index(milestone.on)].height
+        lies = block.still >= REST_S and abs(block.bottom - height) < 1e-3
+        return lies and not block.held_by and self._is_over(block, milestone.on, margin)

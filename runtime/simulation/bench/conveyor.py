@@ -83,7 +83,7 @@ class Conveyor(Tabletop):
     @property
     def running(self) -> bool:
         """Whether the belt has been started and still runs."""
-        return self._reached["beside"] and not self.over
+        return self._beside and not self.over
 
     @property
     def over(self) -> bool:
@@ -103,7 +103,7 @@ class Conveyor(Tabletop):
         """
         distance = self.distance()
         return super().truth() | {
-            "milestones": {"reached": self._reached["beside"], "followed": self.success},
+            "milestones": {"reached": self._beside, "followed": self.success},
             "success": self.success,
             "chase": {
                 "seconds": self._elapsed,
@@ -134,11 +134,11 @@ class Conveyor(Tabletop):
         self._course: BeltMotion = draw_belt_motion(wish.seed, self.belt, COURSE_S)
         self._elapsed = 0.0
         self.escort = TrackingErrors()
-        return BenchLayout(((self._course.x(0.0), self.belt.y, 0.0),), _PLATE)
+        return BenchLayout(((self._course.x(0.0), self.belt.y, 0.0),), (_PLATE,))
 
     def _place_objects(self, wish: ResetRequest) -> None:
         super()._place_objects(wish)
-        self._reached = {"beside": False}
+        self._beside = False
 
     def _step(self, q: Float64, seconds: float) -> None:
         if self.running:
@@ -165,4 +165,4 @@ class Conveyor(Tabletop):
         distance = self.distance()
         if self.running:
             self.escort.add(distance)
-        self._reached["beside"] |= distance <= TOLERANCE_M
+        self._beside |= distance <= TOLERANCE_M

@@ -1,7 +1,7 @@
-"""Simulated tabletop: blocks and a plate; the fingers of any arm push, grasp, carry and drop the blocks.
+"""Simulated tabletop: blocks and discs; the fingers of any arm push, grasp, carry and drop the blocks.
 
 The simulation is deterministic: the same commands at the same times after the same reset have the same result. Only
-fingers touch objects; the plate is fixed.
+fingers touch objects; discs are fixed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 STEP = 1 / 120  # [s] longest step of the physics
 _APART_SPEED = 0.5  # [m/s] speed at which overlapping objects separate
 _WITHIN = 0.25  # [m] from fingertips to a block's centre; farther blocks cannot be touched
-_RIM = 0.002  # [m] below the plate's top; a block that low is beside the plate
+_RIM = 0.002  # [m] below a disc's top; a block that low is beside the disc
 
 
 class Tabletop(BlockTable):
@@ -96,10 +96,13 @@ class Tabletop(BlockTable):
         return block.edge
 
     def _support(self, block: Block) -> float:
-        """Return the height [m] of what supports a block's centre: the table, the plate or another block."""
+        """Return the height [m] of what supports a block's centre: the table, a disc or another block."""
         centre = block.pose[:2, 3]
-        on_plate = float(np.hypot(*(centre - self._plate))) < self.bench.plate_radius
-        heights = [self.bench.plate_height if on_plate else 0.0]
+        heights = [
+            disc.height
+            for disc, place in zip(self.bench.discs, self._discs, strict=True)
+            if float(np.hypot(*(centre - place))) < disc.radius
+        ] or [0.0]
         for support in self._blocks:
             under = support is not block and not support.held_by and block.bottom > support.pose[2, 3]
             if under and np.abs(support.offset(centre)).max() < support.edge / 2:
@@ -118,13 +121,14 @@ class Tabletop(BlockTable):
             block.shift(direction * min(depth, _APART_SPEED * seconds))
 
     def _clear_rim(self, block: Block, seconds: float) -> None:
-        """Slide a block that stands on the table and touches the plate's rim away from the plate.
+        """Slide a block that stands on the table and touches a disc's rim away from the disc.
 
         It moves at a limited speed for `seconds`.
         """
-        if block.bottom > self.bench.plate_height - _RIM:
-            return
-        offset = block.pose[:2, 3] - self._plate
-        depth = self.bench.plate_radius - float(np.hypot(*(block.nearest(self._plate) - self._plate)))
-        if depth > 0:
-            block.shift(offset / max(float(np.hypot(*offset)), 1e-9) * min(depth, _APART_SPEED * seconds))
+        for disc, place in zip(self.bench.discs, self._discs, strict=True):
+            if block.bottom > disc.height - _RIM:
+                continue
+            offset = block.pose[:2, 3] - place
+            depth = disc.radius - float(np.hypot(*(block.nearest(place) - place)))
+            if depth > 0:
+                block.shift(offset / max(float(np.hypot(*offset)), 1e-9) * min(depth, _APART_SPEED * seconds))

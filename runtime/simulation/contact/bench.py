@@ -36,7 +36,7 @@ _SHOWN_RAD = 1e-7  # [rad, or unit of a gripper]
 
 
 class ContactTabletop(BlockTable):
-    """Blocks and a plate in front of a robot, all moved by forces.
+    """Blocks and discs in front of a robot, all moved by forces.
 
     If the plant's joints are set from outside between two steps, the robot is placed there at once.
 
@@ -55,7 +55,8 @@ class ContactTabletop(BlockTable):
         physics: Physics | None = None,
     ) -> None:
         self._mujoco = import_mujoco()
-        self._built = build_model(robot, bench or Bench(), blocks, physics or Physics())
+        bench = bench or Bench()
+        self._built = build_model(robot, bench, len(bench.block_names) + blocks - 1, physics or Physics())
         self._joints = self._built.joints
         self._model = self._built.model
         self._data = self._mujoco.MjData(self._model)
@@ -89,7 +90,8 @@ class ContactTabletop(BlockTable):
         data = self._data
         self._mujoco.mj_resetData(self._model, data)
         data.qpos[self._joints.positions] = values
-        data.mocap_pos[self._built.plate] = *self._plate, 0.0
+        for disc, place in zip(self._built.discs, self._discs, strict=True):
+            data.mocap_pos[disc] = *place, 0.0
         for block, start in zip(self._blocks, self._built.blocks, strict=True):
             data.qpos[start : start + 3] = block.pose[:3, 3]
             self._mujoco.mju_mat2Quat(data.qpos[start + 3 : start + 7], block.pose[:3, :3].ravel())

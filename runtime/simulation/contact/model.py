@@ -1,4 +1,4 @@
-"""MuJoCo model of a bench: a robot's arms, a table, a plate and blocks.
+"""MuJoCo model of a bench: a robot's arms, a table, discs and blocks.
 
 Nothing but contact forces acts between a block and a gripper. The two fingers of a gripper are coupled, as by its rack
 and pinion.
@@ -27,7 +27,7 @@ class ContactModel:
     """Compiled model, with the places of its parts in MuJoCo's arrays.
 
     `blocks` are the indices of the first of the seven position numbers of each block. `block_geoms` maps shapes to the
-    numbers of blocks, `finger_geoms` to an arm and a side. `plate` is the number of the plate among the movable fixed
+    numbers of blocks, `finger_geoms` to an arm and a side. `discs` are the numbers of the discs among the movable fixed
     bodies.
     """
 
@@ -36,7 +36,7 @@ class ContactModel:
     blocks: tuple[int, ...]
     block_geoms: dict[int, int]
     finger_geoms: dict[int, tuple[str, int]]
-    plate: int
+    discs: tuple[int, ...]
 
 
 def build_model(robot: Robot, bench: Bench, blocks: int, physics: Physics) -> ContactModel:
@@ -58,7 +58,7 @@ def build_model(robot: Robot, bench: Bench, blocks: int, physics: Physics) -> Co
         tuple(int(model.joint(name).qposadr[0]) for name in names),
         {int(model.geom(name).id): index for index, name in enumerate(names)},
         {int(model.geom(name).id): finger for name, finger in arms.fingers.items()},
-        int(model.body("plate").mocapid[0]),
+        tuple(int(model.body(_disc_name(index)).mocapid[0]) for index in range(len(bench.discs))),
     )
 
 
@@ -79,12 +79,18 @@ def _new_spec(mujoco: Any) -> Any:
 def _add_objects(spec: Any, geoms: Geoms, bench: Bench, blocks: int, physics: Physics) -> None:
     world = spec.worldbody
     geoms.add_plane(world, physics.table_friction)
-    middle = np.eye(4)
-    middle[2, 3] = bench.plate_height / 2
-    disc = Solid("cylinder", (bench.plate_radius, bench.plate_height), middle)
-    geoms.add_solid(world.add_body(name="plate", mocap=True), disc, physics.plate_friction)
+    for index, disc in enumerate(bench.discs):
+        middle = np.eye(4)
+        middle[2, 3] = disc.height / 2
+        solid = Solid("cylinder", (disc.radius, disc.height), middle)
+        geoms.add_solid(world.add_body(name=_disc_name(index), mocap=True), solid, physics.plate_friction)
     for index in range(blocks):
         body = world.add_body(name=f"block {index}")
         body.add_freejoint(name=f"block {index}")
-        geom = geoms.add_block(body, bench.block_edge, physics.block_friction)
-        geom.name, geom.mass = f"block {index}", physics.block_mass
+        edge = bench.edge(index)
+        geom = geoms.add_block(body, edge, physics.block_friction)
+        geom.name, geom.mass = f"block {index}", physics.block_mass * (edge / numbers.BLOCK_EDGE) ** 3
+
+
+def _disc_name(index: int) -> str:
+    return f"disc {index}"

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 STEP = 1 / 240  # [s] longest step of the solver
+BLOCK_EDGE = 0.04  # [m] of the cube that has `Physics.block_mass`
 PLANT_STEP = 1 / 60  # [s] longest step of the references, which move at constant speed during a step
 
 # Contacts, see "Solver parameters" of MuJoCo's documentation. A time constant is at least two steps of the solver. The
@@ -26,9 +27,9 @@ class Physics:
 
     Two surfaces in contact have the greater of their two coefficients, as MuJoCo combines them.
 
-    `block_mass`: a cube of 40 mm of beech (700 kg/m3). `finger_friction`: rubber on wood, tables give 0.7 to 0.95.
-    `block_friction`: painted wood on painted wood, `table_friction`: wood on a rough table top, `plate_friction`: wood
-    on glazed ceramic; placeholders within what tables give for such surfaces.
+    `block_mass`: a cube of 40 mm of beech (700 kg/m3); other cubes have the same density. `finger_friction`: rubber on
+    wood, tables give 0.7 to 0.95. `block_friction`: painted wood on painted wood, `table_friction`: wood on a rough
+    table top, `plate_friction`: wood on glazed ceramic; placeholders within what tables give for such surfaces.
     """
 
     block_mass: float = 0.045

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from runtime.core.types import Float32, UInt8
-from runtime.simulation.bench.bench import Bench, PinholeCamera
+from runtime.simulation.bench.bench import DiscShape, PinholeCamera
 from runtime.simulation.render.painter import fill_ahead
 from runtime.simulation.render.solids import circle
 
@@ -23,10 +23,10 @@ _INSIDE = (  # share of the radius, share of the height, brightness; from the ri
 class Plate:
     """Plate as concentric rings, each of which is drawn over the previous ones."""
 
-    def __init__(self, bench: Bench) -> None:
-        radius, height = bench.plate_radius, bench.plate_height
-        rim = np.array(bench.plate_rim_colour[::-1], np.float64)
-        white = np.array(bench.plate_colour[::-1], np.float64)
+    def __init__(self, disc: DiscShape) -> None:
+        radius, height = disc.radius, disc.height
+        rim = np.array(disc.rim_colour[::-1], np.float64)
+        white = np.array(disc.colour[::-1], np.float64)
         levels = [(0.92, 0.0), (1.0, 1.0), *((share, level) for share, level, _ in _INSIDE)]
         self._rings = np.array(
             [

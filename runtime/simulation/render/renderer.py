@@ -33,7 +33,7 @@ class Renderer:
         self._size = width, height
         self._scene = scene_of(robot)
         self._table = Table(bench, seed)
-        self._plate = Plate(bench)
+        self._plates = [Plate(disc) for disc in bench.discs]
         self._shadows = Shadows(bench)
         self._solids: dict[int, Solids] = {}  # by number of blocks
         q = robot.poses["home"]
@@ -49,13 +49,14 @@ class Renderer:
         frames = np.array([*self._scene.poses(q), *(block.pose for block in state.blocks)])
         whole = solids.placed(frames)
         placed = solids.above_table(whole)
-        light = self._shadows.cast(solids, placed, state.plate)
+        light = self._shadows.cast(solids, placed, state.discs)
         painter = Painter(solids, placed)
         pictures = {}
         for key, camera in self._cameras(q).items():
             still = self._still.get(key)
             picture = self._table.draw(camera) if still is None else still.copy()
-            self._plate.draw(picture, camera, state.plate)
+            for plate, place in zip(self._plates, state.discs, strict=True):
+                plate.draw(picture, camera, place)
             darken(picture, camera, light)
             under = camera.pose[2, 3] < 0  # camera below the table: a simulated arm can go there
             (Painter(solids, whole) if under else painter).paint(picture, camera)
@@ -79,8 +80,7 @@ class Renderer:
         return self._solids[blocks]
 
     def _block(self, index: int) -> Solid:
-        colours = self._bench.block_colours
-        red, green, blue = (part / 255 for part in colours[index % len(colours)])
-        edge = self._bench.block_edge
+        red, green, blue = (part / 255 for part in self._bench.colour(index))
+        edge = self._bench.edge(index)
         frame = len(self._scene.parts) + index
         return Solid(frame, "box", (edge, edge, edge), np.eye(4), (red, green, blue), painted=True)

@@ -17,6 +17,8 @@ from runtime.simulation.render.table import (
     texels_to_pixels,
 )
 
+Places = tuple[tuple[float, float], ...]
+
 _TEXEL = 0.004  # [m] per point of the map
 _SOFT_FROM = 0.09  # [m] height above the table from which shadows are soft
 
@@ -28,19 +30,18 @@ class Shadows:
         self._bench = bench
         size = ((Y[1] - Y[0]) / _TEXEL, (X[1] - X[0]) / _TEXEL)
         self._shape = (round(size[0]), round(size[1]))
-        self._under_plate: tuple[tuple[float, float], UInt8] | None = None
+        self._under_discs: tuple[Places, UInt8] | None = None
 
-    def cast(self, solids: Solids, placed: Placed, plate: tuple[float, float]) -> UInt8:
-        """Return the map of the light for solids and a plate.
+    def cast(self, solids: Solids, placed: Placed, discs: Places) -> UInt8:
+        """Return the map of the light for solids, and for discs at their places (x, y) [m].
 
         Shadows are dark and sharp below low solids, light and soft below high solids.
         """
         vertices = placed.vertices
-        floor = np.where(
-            np.hypot(*(placed.centres[:, :2] - np.array(plate)).T) < self._bench.plate_radius * 0.9,
-            np.float32(self._bench.plate_height * 0.4),
-            np.float32(0),
-        )
+        floor = np.zeros(len(placed.centres), np.float32)
+        for disc, place in zip(self._bench.discs, discs, strict=True):
+            over = np.hypot(*(placed.centres[:, :2] - np.array(place)).T) < disc.radius * 0.9
+            floor[over] = disc.height * 0.4
         counts = solids.stops - solids.starts
         height = np.maximum(vertices[:, 2:] - np.repeat(floor, counts)[:, None], 0)
         points = vertices[:, :2] - height * (LIGHT[:2] / LIGHT[2])
@@ -55,22 +56,23 @@ class Shadows:
         blurred = cv2.min(
             cv2.blur(cv2.blur(soft, (13, 13)), (9, 9)), cv2.blur(cv2.blur(sharp, (5, 5)), (3, 3))
         )
-        return np.asarray(cv2.min(blurred, self._plate_map(plate)), np.uint8)
+        return np.asarray(cv2.min(blurred, self._disc_map(discs)), np.uint8)
 
-    def _plate_map(self, plate: tuple[float, float]) -> UInt8:
-        """Return the map that contains only the shadow of the plate.
+    def _disc_map(self, discs: Places) -> UInt8:
+        """Return the map that contains only the shadows of discs.
 
-        The shadow falls on the table around the plate, and not on the plate itself.
+        The shadow falls on the table around a disc, and not on the disc itself.
         """
-        if self._under_plate is None or self._under_plate[0] != plate:
+        if self._under_discs is None or self._under_discs[0] != discs:
             shade = np.full(self._shape, 255, np.uint8)
-            height, radius = self._bench.plate_height, self._bench.plate_radius
-            fallen = np.array(plate) - height * LIGHT[:2] / LIGHT[2]
-            self._disc(shade, fallen, radius * 1.02, 120)
+            placed = list(zip(self._bench.discs, map(np.array, discs), strict=True))
+            for disc, place in placed:
+                self._disc(shade, place - disc.height * LIGHT[:2] / LIGHT[2], disc.radius * 1.02, 120)
             shade = np.asarray(cv2.blur(cv2.blur(shade, (5, 5)), (5, 5)), np.uint8)
-            self._disc(shade, np.array(plate), radius * 0.99, 255)
-            self._under_plate = plate, shade
-        return self._under_plate[1]
+            for disc, place in placed:
+                self._disc(shade, place, disc.radius * 0.99, 255)
+            self._under_discs = discs, shade
+        return self._under_discs[1]
 
     @staticmethod
     def _disc(shade: UInt8, centre: Float64, radius: float, light: int) -> None:

@@ -198,7 +198,7 @@ def add_arguments(line: argparse.ArgumentParser) -> None:
         "--deadline", type=positive, default=0.3, help="seconds without a command until it holds"
     )
     line.add_argument("--seed", type=int, default=0, help="grain of the pictures, first layout")
-    line.add_argument("--bench", choices=environments.NAMES, default="none", help="what there is to touch")
+    line.add_argument("--bench", default="none", help="what there is to touch, as of runtime.simulation.node")
     line.add_argument("--blocks", type=int, default=1, help="on the tabletop; the first is the task's")
     line.add_argument("--start-pose", metavar="NAME", default="home", help="a pose of the robot")
     line.add_argument("--no-eef", action="store_true", help="it publishes no poses of its end effectors")

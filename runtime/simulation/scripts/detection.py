@@ -1,4 +1,4 @@
-"""Detection of the task's block and the plate by colour in the overhead image.
+"""Detection of blocks and discs by colour in the overhead image.
 
 A scripted policy has no other knowledge of their places. An object that is partly hidden by an arm does not have the
 size or shape expected at its place, and is reported as not detected.
@@ -7,7 +7,8 @@ size or shape expected at its place, and is reported as not detected.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from runtime.core.types import Float64, UInt8
 from runtime.simulation.bench import bench
-from runtime.simulation.bench.bench import Bench, BenchError, PinholeCamera
+from runtime.simulation.bench.bench import Bench, BenchError, DiscShape, PinholeCamera
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -28,7 +29,7 @@ _HUE = 9  # tolerance of hue to each side, of 180
 _SATURATION = 0.45  # least share of the colour's own saturation
 _DARKEST = 40  # least value, of 255; low, because colours are also detected in shadow
 _BLOCK_SIZE = (0.7, 1.4)  # range of detected area over expected area
-_PLATE_SIZE = (0.85, 1.2)
+_DISC_SIZE = (0.85, 1.2)
 _ROUND = 1.15  # largest ratio of longest to shortest width of a disc
 _RING = 0.6  # largest share of a ring's enclosed area that has its colour
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
@@ -45,6 +46,15 @@ class Detection:
 
     block: tuple[float, float, float] | None = None
     plate: tuple[float, float] | None = None
+    dark: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class BenchDetection:
+    """All detected blocks (x, y, yaw) by colour, and discs (x, y) by name, in the world [m, rad]."""
+
+    blocks: Mapping[bench.Colour, Sequence[tuple[float, float, float]]] = field(default_factory=dict)
+    discs: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     dark: bool = False
 
 
@@ -73,18 +83,42 @@ class OverheadDetector:
         if int(image.max(initial=0)) < _DARKEST:
             return Detection(dark=True)
         hsv = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2HSV)
-        return Detection(self._block(image, hsv), self._plate(hsv))
+        contour = _largest(_mask(hsv, self._bench.colour(0)))
+        block = None if contour is None else self._block_in(contour, image, self._bench.colour(0))
+        return Detection(block, self._disc(hsv, self._bench.discs[0]))
 
-    def _block(self, image: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
-        """Return the block's place and yaw from its silhouette, or None.
+    def detect_all(self, picture: UInt8) -> BenchDetection:
+        """Detect all blocks by colour, and all discs by name, in an image as `detect` has it.
+
+        Raises:
+            BenchError: If the image has another shape.
+        """
+        image = _without_bars(_channels_last(picture))
+        if int(image.max(initial=0)) < _DARKEST:
+            return BenchDetection(dark=True)
+        hsv = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2HSV)
+        colours = dict.fromkeys(self._bench.colour(index) for index in range(len(self._bench.block_names)))
+        discs = {disc.name: self._disc(hsv, disc) for disc in self._bench.discs}
+        return BenchDetection(
+            {
+                colour: tuple(
+                    block
+                    for contour in _outlines(_mask(hsv, colour))
+                    if (block := self._block_in(contour, image, colour)) is not None
+                )
+                for colour in colours
+            },
+            {name: place for name, place in discs.items() if place is not None},
+        )
+
+    def _block_in(
+        self, contour: Matrix, image: UInt8, colour: bench.Colour
+    ) -> tuple[float, float, float] | None:
+        """Return a block's place and yaw from its silhouette, or None.
 
         The place is computed from the middle of the smallest rectangle around the silhouette, at half the block's
         height; the yaw from the direction of this rectangle.
         """
-        colour = self._bench.block_colours[0]
-        contour = _largest(_mask(hsv, colour))
-        if contour is None:
-            return None
         left, top, width, height = cv2.boundingRect(contour)
         rows = slice(max(0, top - 2), top + height + 2)
         columns = slice(max(0, left - 2), left + width + 2)
@@ -116,25 +150,25 @@ class OverheadDetector:
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
         return _area(self._camera, self._bench.block_edge * _CORNERS @ turn + (x, y, 0.0))
 
-    def _plate(self, hsv: Matrix) -> tuple[float, float] | None:
-        """Return the middle of the outer edge of the plate's rim.
+    def _disc(self, hsv: Matrix, disc: DiscShape) -> tuple[float, float] | None:
+        """Return the middle of the outer edge of a disc's rim.
 
-        A solid disc of the rim's colour is no plate but part of a robot.
+        A solid area of the rim's colour is no disc but part of a robot.
         """
-        mask = _mask(hsv, self._bench.plate_rim_colour)
+        mask = _mask(hsv, disc.rim_colour)
         rim = _largest(mask)
         if rim is None or len(rim) < 5:
             return None
         pixels = self._native(rim[:, 0].astype(np.float64), hsv)
         hull = cv2.convexHull(pixels.astype(np.float32))
         (u, v), (width, height), _ = cv2.minAreaRect(hull)
-        x, y = self._camera.pixel_to_table(u, v, self._bench.plate_height)
+        x, y = self._camera.pixel_to_table(u, v, disc.height)
         turns = np.linspace(0.0, 2 * math.pi, 48, endpoint=False)
-        radius = self._bench.plate_radius
+        radius = disc.radius
         circle = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
-        expected = _area(self._camera, np.insert(circle, 2, self._bench.plate_height, axis=1))
+        expected = _area(self._camera, np.insert(circle, 2, disc.height, axis=1))
         is_round = max(width, height) <= _ROUND * min(width, height) and _is_ring(mask, rim)
-        return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _PLATE_SIZE) else None
+        return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _DISC_SIZE) else None
 
     def _native(self, pixels: Float64, image: Matrix) -> Float64:
         """Convert pixels [n, 2] of `image` to pixels of the camera."""
@@ -176,8 +210,13 @@ def _mask(hsv: Matrix, colour: bench.Colour) -> Matrix:
 
 def _largest(mask: Matrix) -> Matrix | None:
     """Return the outline [n, 1, 2] of the largest region; None if there is none."""
+    return max(_outlines(mask), key=cv2.contourArea, default=None)
+
+
+def _outlines(mask: Matrix) -> Sequence[Matrix]:
+    """Return the outline [n, 1, 2] of each region."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return max(outlines, key=cv2.contourArea, default=None)
+    return outlines
 
 
 def _is_ring(mask: Matrix, outline: Matrix) -> bool:

@@ -88,11 +88,12 @@ class PickPlace(Script):
         name: str | None = None,
         clock: Clock | None = None,
         apart: Apart | None = None,
+        table: Bench | None = None,
     ) -> None:
         self.robot, self.clock = robot, clock or MonotonicClock()
         self.apart = apart or joints_apart(robot)
         self.horizon, self.rate, self.skill = horizon, rate, skill
-        self.table = Bench()
+        self.table = table or Bench()
         self.overhead = OverheadDetector(robot, self.table)
         self.planner = RoutePlanner(robot, rate, self.table)
         self._episodes = itertools.count()
@@ -163,10 +164,14 @@ class PickPlaceEpisode:
         return self._still(q) if self._route is None else self._ahead(self._route)
 
     def _detect(self, pictures: Mapping[str, UInt8]) -> Detection:
+        return self._policy.overhead.detect(self._picture(pictures))
+
+    def _picture(self, pictures: Mapping[str, UInt8]) -> UInt8:
+        """Return the overhead image of a request."""
         key = self._policy.overhead.key
         if key not in pictures:
             raise ScriptError(f"the request has no picture {key!r}; it has {', '.join(pictures) or 'none'}")
-        return self._policy.overhead.detect(pictures[key])
+        return pictures[key]
 
     # --- deciding ------------------------------------------------------------------------------------------
 
@@ -174,7 +179,7 @@ class PickPlaceEpisode:
         """Plan a route if block and plate are detected and the block is not on the plate yet."""
         if detection.block is None or detection.plate is None:
             return
-        if math.dist(detection.block[:2], detection.plate) < self._policy.table.plate_radius - _MARGIN:
+        if self._is_done(detection.block, detection.plate):
             self._forget()
             return
         if self._resigned:
@@ -189,6 +194,10 @@ class PickPlaceEpisode:
         if route is not None:
             self._seen = detection
             self._follow_route(route)
+
+    def _is_done(self, block: tuple[float, float, float], plate: tuple[float, float]) -> bool:
+        """Return True if the block is on the plate already."""
+        return math.dist(block[:2], plate) < self._policy.table.discs[0].radius - _MARGIN
 
     def _follow_route(self, route: Route | None) -> None:
         self._route, self._leg, self._row = route, 0, 0.0

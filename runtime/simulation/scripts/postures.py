@@ -109,7 +109,7 @@ class Postures:
         bearing = self._bearing(arm, (x, y))
         twist = math.remainder(block[2] - bearing, math.pi / 2)  # of the jaws, from across the arm
         low = _GRASP * self._table.block_edge
-        put = self._table.plate_height + low + _DROP
+        put = self._table.discs[0].height + low + _DROP
         first: tuple[Float64 | None, Float64 | None] = None, None
         for turned in (twist, twist - math.copysign(math.pi / 2, twist)):
             down = self._down(arm, q, (x, y), turned, (low, CLEAR), tilts)

@@ -11,6 +11,7 @@ import numpy as np
 
 import robots
 from robots import Robot
+from runtime.benches.schema import load_schema
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, UInt8
 from runtime.motion.timeline import DimensionKinds, Timeline
@@ -23,6 +24,7 @@ from runtime.simulation.bench.tabletop import Tabletop
 from runtime.simulation.render import Renderer
 from runtime.simulation.scripts.pick_place import PickPlace, Skill
 from runtime.simulation.scripts.script import Answer
+from runtime.simulation.scripts.sorting import Sorting
 from runtime.strategies import overlap
 from runtime.strategies.base import ArrivedChunk
 
@@ -36,9 +38,9 @@ _LIMITS = Limits(
 
 
 @cache
-def renderer() -> Renderer:
+def renderer(bench: str = "tabletop") -> Renderer:
     seeing = replace(ROBOT, cameras=tuple(camera for camera in ROBOT.cameras if camera.key == CAMERA))
-    return Renderer(seeing, Bench(), 640, 480)
+    return Renderer(seeing, Bench(load_schema(bench)), 640, 480)
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,16 @@ class Trial:
         delay: int = 6,
         pose: str = "ready",
         make: Callable[[Robot, int], BlockTable] = Tabletop,
+        prompt: str = "put the block on the plate",
+        bench: str = "tabletop",
     ) -> None:
         self.clock = VirtualClock()
-        self.policy = PickPlace(ROBOT, 50, RATE, skill, clock=self.clock)
+        self.prompt, self.bench = prompt, bench
+        self.policy = (
+            PickPlace(ROBOT, 50, RATE, skill, clock=self.clock)
+            if bench == "tabletop"
+            else Sorting(ROBOT, 50, RATE, skill, Bench(load_schema(bench)), clock=self.clock)
+        )
         self.delay = delay
         self.pose = pose
         self.plant = Plant(ROBOT)
@@ -92,7 +101,7 @@ class Trial:
 
     def picture(self) -> UInt8:
         """What the policy is sent: 224 by 224, letterboxed, channels first, RGB."""
-        shown = renderer().draw(self.plant.q, self.table.state())[CAMERA]
+        shown = renderer(self.bench).draw(self.plant.q, self.table.state())[CAMERA]
         whole = (
             np.zeros_like(shown)
             if self.dark
@@ -103,7 +112,7 @@ class Trial:
     def ask(self) -> Float64:
         """The rows for this moment."""
         q = self.plant.q.astype(np.float32).astype(np.float64)
-        return self.answer(q, {CAMERA: self.picture()}, "put the block on the plate").astype(np.float64)
+        return self.answer(q, {CAMERA: self.picture()}, self.prompt).astype(np.float64)
 
     def run(self, seconds: float = 30.0, to_the_end: bool = False) -> Outcome:
         """Ask back to back, every answer `delay` ticks late, until success or for so long."""

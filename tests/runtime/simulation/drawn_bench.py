@@ -22,13 +22,13 @@ def drawn(layout: BenchLayout, z: float = 0.0, light: float = 1.0) -> np.ndarray
     shape = (CAMERA.height * _FINER, CAMERA.width * _FINER, 3)
     canvas = np.tile(np.uint8(np.multiply(BENCH.table_colour, light)), (*shape[:2], 1))
     for radius, colour in (
-        (BENCH.plate_radius, BENCH.plate_rim_colour),
-        (BENCH.plate_radius - 0.012, BENCH.plate_colour),
+        (BENCH.discs[0].radius, BENCH.discs[0].rim_colour),
+        (BENCH.discs[0].radius - 0.012, BENCH.discs[0].colour),
     ):
         turns = np.linspace(0, 2 * math.pi, 90)
-        x, y = layout.plate
+        x, y = layout.discs[0]
         ring = np.column_stack(
-            [x + radius * np.cos(turns), y + radius * np.sin(turns), np.full(90, BENCH.plate_height)]
+            [x + radius * np.cos(turns), y + radius * np.sin(turns), np.full(90, BENCH.discs[0].height)]
         )
         _fill(canvas, ring, np.multiply(colour, light))
     if layout.blocks:
@@ -37,14 +37,14 @@ def drawn(layout: BenchLayout, z: float = 0.0, light: float = 1.0) -> np.ndarray
 
 
 def _block(canvas: np.ndarray, block: tuple[float, float, float], z: float, light: float) -> None:
-    pose = bench.block_pose(block, BENCH)
+    pose = bench.block_pose(block, BENCH.block_edge)
     half = BENCH.block_edge / 2
     signs = np.array([(x, y, up) for up in (1, -1) for x in (-1, 1) for y in (-1, 1)])
     corners = signs * half @ pose[:3, :3].T + pose[:3, 3] + (0, 0, z)
     eye = CAMERA.pose[:3, 3]
     faces = [(corners[list(face)], shade) for face, shade in zip(_FACES, _SHADES, strict=True)]
     for face, shade in sorted(faces, key=lambda item: -np.linalg.norm(item[0].mean(axis=0) - eye)):
-        _fill(canvas, face, np.multiply(BENCH.block_colours[0], shade * light))
+        _fill(canvas, face, np.multiply(BENCH.colour(0), shade * light))
 
 
 def _fill(canvas: np.ndarray, points: np.ndarray, colour: np.ndarray) -> None:

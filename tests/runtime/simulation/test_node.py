@@ -391,7 +391,7 @@ def test_a_tabletop_says_how_it_really_is(tabletop: Bench) -> None:
     assert truth["reset"] == ""
     assert truth["seed"] == 5
     assert truth["blocks"] == [pytest.approx([*layout.blocks[0][:2], 0.02, layout.blocks[0][2]])]
-    assert truth["plate"] == pytest.approx(layout.plate)
+    assert truth["plate"] == pytest.approx(layout.discs[0])
     assert truth["held"] == [""]
     assert truth["milestones"] == {"grasped": False, "lifted": False, "over_plate": False, "placed": False}
     assert truth["success"] is False

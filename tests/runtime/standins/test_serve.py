@@ -182,7 +182,7 @@ def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve
         metadata = receive(connection)
         connection.send(request(images={"cam_high": np.zeros((3, 224, 224), np.uint8)}))
         dark = receive(connection)["actions"]
-        seen = resize_image(drawn(BenchLayout(((0.1, 0.34, 0.0),), (-0.3, 0.15))), 224, 224, "pad")
+        seen = resize_image(drawn(BenchLayout(((0.1, 0.34, 0.0),), ((-0.3, 0.15),))), 224, 224, "pad")
         connection.send(request(images={"cam_high": to_layout(seen, "chw")}))
         moving = receive(connection)["actions"]
     assert metadata["name"] == "chase"

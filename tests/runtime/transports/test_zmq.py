@@ -781,7 +781,7 @@ def test_a_drive_state_that_cannot_be_used_is_left_out_and_named(node: Node, dri
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_only_a_node_that_is_declared_simulated_is_told_to_reset_its_bench(simulated: bool) -> None:
-    assert link.capabilities(Config(simulated=simulated)).resets_bench is simulated
+    assert link.capabilities(Config(simulated=simulated)).bench == ("tabletop" if simulated else "")
 
 
 def test_a_control_word_says_who_sends_it_and_stands_where_a_command_says_its_target(node: Node) -> None:

@@ -57,9 +57,10 @@ class BenchReset:
         """
         if bench is None:
             return None
-        if not self._plan.capabilities.resets_bench:
+        if not self._plan.capabilities.bench:
             raise SetupError(_NOT_SIMULATED(seed=bench.seed))
-        if problem := next(load_schema("tabletop").problems(bench.positions or {}), ""):
+        schema = load_schema(self._plan.capabilities.bench)
+        if problem := next(schema.problems(bench.positions or {}), ""):
             raise SetupError(_NO_LAYOUT(why=problem))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
             raise SetupError(_RESET_ALREADY(identity=bench.id))

@@ -88,7 +88,7 @@ def test_in_pose_ready_fingers_point_down_open_and_leave_the_area_in_view() -> N
 
 def test_poses_on_the_table_and_their_yaw_agree() -> None:
     for yaw in (-3.0, 0.0, 0.4, 1.6):
-        pose = bench.block_pose((0.1, 0.2, yaw), Bench())
+        pose = bench.block_pose((0.1, 0.2, yaw), Bench().block_edge)
         assert bench.yaw_of(pose) == pytest.approx(yaw)
         assert pose[2, 3] == Bench().block_edge / 2
 

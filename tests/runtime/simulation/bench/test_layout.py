@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
-from runtime.simulation.bench.bench import Bench, BenchError
+from runtime.simulation.bench.bench import TABLETOP, Bench, BenchError
 from runtime.simulation.bench.layout import (
-    APART_M,
     NOISE_M,
     NOISE_RAD,
     draw_layout,
@@ -18,6 +17,7 @@ from runtime.simulation.bench.layout import (
 
 ROBOT = robots.load_robot("agilex_piper")
 X_FROM, X_TO, Y_FROM, Y_TO = Bench().area
+APART_M = TABLETOP.distance("block", "plate")
 SEEDS = st.integers(0, 2**63 - 1)
 
 
@@ -25,14 +25,14 @@ SEEDS = st.integers(0, 2**63 - 1)
 def test_every_layout_lies_in_the_area_apart_and_on_one_side(seed: int, blocks: int) -> None:
     layout = draw_layout(seed, None, blocks)
     assert len(layout.blocks) == blocks
-    for x, y, _ in [*layout.blocks, (*layout.plate, 0.0)]:
+    for x, y, _ in [*layout.blocks, (*layout.discs[0], 0.0)]:
         assert X_FROM <= x <= X_TO
         assert Y_FROM <= y <= Y_TO
-    assert all(math.dist(block[:2], layout.plate) >= APART_M for block in layout.blocks)
+    assert all(math.dist(block[:2], layout.discs[0]) >= APART_M for block in layout.blocks)
     apart = [math.dist(a[:2], b[:2]) for a in layout.blocks for b in layout.blocks if a is not b]
     assert min(apart, default=1.0) > 0.08
     feet = [arm.mount[:2] for arm in ROBOT.arms]
-    task = (layout.blocks[0][:2], layout.plate)
+    task = (layout.blocks[0][:2], layout.discs[0])
     assert any(all(math.dist(foot, place) <= 0.42 for place in task) for foot in feet)
 
 
@@ -42,7 +42,7 @@ def test_a_layout_is_always_the_same_for_a_seed_and_near_what_was_asked_for(seed
     layout = draw_layout(seed, positions)
     assert layout == draw_layout(seed, positions)
     x, y, yaw = layout.blocks[0]
-    assert np.abs(np.subtract((x, y, *layout.plate), (0.1, 0.2, 0.15, 0.36))).max() <= NOISE_M
+    assert np.abs(np.subtract((x, y, *layout.discs[0]), (0.1, 0.2, 0.15, 0.36))).max() <= NOISE_M
     assert abs(yaw - math.radians(30)) <= NOISE_RAD
 
 

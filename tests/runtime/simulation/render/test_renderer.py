@@ -20,11 +20,13 @@ RENDERER = Renderer(ROBOT, BENCH, 640, 480)
 
 
 def state(*blocks: tuple[float, float, float], plate: tuple[float, float] = (0.1, 0.36)) -> BenchState:
-    return BenchState(tuple(BlockState(benches.block_pose(block, BENCH)) for block in blocks), plate)
+    return BenchState(
+        tuple(BlockState(benches.block_pose(block, BENCH.block_edge)) for block in blocks), (plate,)
+    )
 
 
 def in_hand() -> BenchState:
-    return BenchState((BlockState(benches.tip_in_world(ROBOT, LEFT, DOWN), LEFT.name),), (0.1, 0.36))
+    return BenchState((BlockState(benches.tip_in_world(ROBOT, LEFT, DOWN), LEFT.name),), ((0.1, 0.36),))
 
 
 def orange(picture: np.ndarray) -> np.ndarray:
@@ -70,7 +72,7 @@ def test_the_same_seed_draws_the_same_and_another_seed_another_table() -> None:
 @pytest.mark.parametrize("block", [(0.0, 0.3, 0.0), (-0.2, 0.38, 0.5), (0.21, 0.2, -0.7)])
 def test_the_block_is_where_the_overhead_camera_projects_it(block: tuple[float, float, float]) -> None:
     camera = benches.overhead_camera(640, 480)
-    wanted = outline(camera, benches.block_pose(block, BENCH))
+    wanted = outline(camera, benches.block_pose(block, BENCH.block_edge))
     seen = orange(RENDERER.draw(HOME, state(block, plate=(0.0, 0.5)))["cam_high"])
     assert np.linalg.norm(middle(seen) - middle(wanted)) < 1.0
     assert (seen & wanted).sum() / (seen | wanted).sum() > 0.9
@@ -129,13 +131,13 @@ def test_things_cast_shadows_on_the_table_beside_them() -> None:
 def test_the_plate_lies_where_it_is_said_to_and_a_block_can_lie_on_it() -> None:
     camera = benches.overhead_camera(640, 480)
     plate = (-0.05, 0.3)
-    on_plate = benches.block_pose((*plate, 0.3), BENCH)
-    on_plate[2, 3] += BENCH.plate_height
-    picture = RENDERER.draw(HOME, BenchState((BlockState(on_plate),), plate))["cam_high"]
-    rim = BENCH.plate_radius * 0.965
+    on_plate = benches.block_pose((*plate, 0.3), BENCH.block_edge)
+    on_plate[2, 3] += BENCH.discs[0].height
+    picture = RENDERER.draw(HOME, BenchState((BlockState(on_plate),), (plate,)))["cam_high"]
+    rim = BENCH.discs[0].radius * 0.965
     for x, y in ((rim, 0), (-rim, 0), (0, rim), (0, -rim)):
         column, row = (
-            camera.project(np.array([plate[0] + x, plate[1] + y, BENCH.plate_height])).round().astype(int)
+            camera.project(np.array([plate[0] + x, plate[1] + y, BENCH.discs[0].height])).round().astype(int)
         )
         blue, green, red = picture[row, column].astype(int)
         assert blue > green + 30 > red + 30

@@ -39,7 +39,7 @@ class Watcher:
         """The rows, `after` seconds later, for a block there, or for none."""
         self.clock.advance(after)
         blocks = () if x is None else ((x, BELT.y, 0.0),)
-        return self.answer(q, {"cam_high": drawn(BenchLayout(blocks, ASIDE))}, "").astype(np.float64)
+        return self.answer(q, {"cam_high": drawn(BenchLayout(blocks, (ASIDE,)))}, "").astype(np.float64)
 
 
 def beside(x: float) -> Float64:

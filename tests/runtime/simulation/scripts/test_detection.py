@@ -24,7 +24,7 @@ from tests.runtime.simulation.drawn_bench import BENCH, CAMERA, drawn
 
 ROBOT = robots.load_robot("agilex_piper")
 EYE = OverheadDetector(ROBOT)
-LAYOUT = BenchLayout(((-0.12, 0.25, 0.3),), (0.05, 0.33))
+LAYOUT = BenchLayout(((-0.12, 0.25, 0.3),), ((0.05, 0.33),))
 
 
 def letterboxed(picture):
@@ -37,7 +37,7 @@ def assert_seen(sight, layout, within=0.003, turn=0.07):
     assert sight.plate is not None
     assert math.dist(sight.block[:2], (x, y)) < within
     assert abs(math.remainder(sight.block[2] - yaw, math.pi / 2)) < turn
-    assert math.dist(sight.plate, layout.plate) < within
+    assert math.dist(sight.plate, layout.discs[0]) < within
 
 
 def test_it_looks_through_the_camera_that_is_on_no_arm():
@@ -57,8 +57,8 @@ def test_block_and_plate_are_found_in_the_picture_that_a_policy_is_sent(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_block_and_plate_are_found_in_rendered_pictures(seed):
     layout = draw_layout(100 + seed)
-    blocks = tuple(BlockState(bench.block_pose(block, BENCH)) for block in layout.blocks)
-    state = BenchState(blocks, layout.plate)
+    blocks = tuple(BlockState(bench.block_pose(block, BENCH.block_edge)) for block in layout.blocks)
+    state = BenchState(blocks, layout.discs)
     picture = Renderer(ROBOT, Bench(), 640, 480).draw(ROBOT.poses["ready"], state)[EYE.key][..., ::-1]
     assert_seen(EYE.detect(letterboxed(np.ascontiguousarray(picture))), layout)
 
@@ -76,8 +76,8 @@ def test_the_light_does_not_matter(light):
 
 
 def test_a_block_on_the_plate_is_found_there():
-    layout = BenchLayout(((0.05, 0.33, 0.2),), (0.05, 0.33))
-    sight = EYE.detect(letterboxed(drawn(layout, BENCH.plate_height)))
+    layout = BenchLayout(((0.05, 0.33, 0.2),), ((0.05, 0.33),))
+    sight = EYE.detect(letterboxed(drawn(layout, BENCH.discs[0].height)))
     assert_seen(sight, layout, within=0.006, turn=0.1)
 
 
@@ -86,15 +86,15 @@ def test_nothing_is_seen_in_the_dark():
 
 
 def test_an_empty_table_has_a_plate_at_most():
-    sight = EYE.detect(letterboxed(drawn(BenchLayout((), LAYOUT.plate))))
+    sight = EYE.detect(letterboxed(drawn(BenchLayout((), LAYOUT.discs))))
     assert sight.block is None
-    assert sight.plate == pytest.approx(LAYOUT.plate, abs=0.003)
+    assert sight.plate == pytest.approx(LAYOUT.discs[0], abs=0.003)
     assert EYE.detect(np.full((3, 224, 224), 128, np.uint8)) == Detection()
 
 
 @pytest.mark.parametrize("thing", ["block", "plate"])
 def test_what_is_covered_in_part_is_not_seen(thing):
-    place = LAYOUT.blocks[0][:2] if thing == "block" else LAYOUT.plate
+    place = LAYOUT.blocks[0][:2] if thing == "block" else LAYOUT.discs[0]
     u, v = CAMERA.project(np.array([*place, BENCH.block_edge / 2]))
     picture = drawn(LAYOUT)
     cv2.rectangle(picture, (int(u), int(v) - 90), (int(u) + 90, int(v) + 90), (230, 230, 230), -1)
@@ -110,12 +110,12 @@ def test_a_picture_of_another_shape_is_refused():
 
 def test_a_solid_disc_of_the_rims_colour_is_no_plate():
     picture = np.tile(np.uint8(BENCH.table_colour), (480, 640, 1))
-    u, v = CAMERA.project(np.array([*LAYOUT.plate, BENCH.plate_height]))
+    u, v = CAMERA.project(np.array([*LAYOUT.discs[0], BENCH.discs[0].height]))
     edge, _ = CAMERA.project(
-        np.array([LAYOUT.plate[0] + BENCH.plate_radius, LAYOUT.plate[1], BENCH.plate_height])
+        np.array([LAYOUT.discs[0][0] + BENCH.discs[0].radius, LAYOUT.discs[0][1], BENCH.discs[0].height])
     )
-    colour = tuple(int(part) for part in BENCH.plate_rim_colour)
+    colour = tuple(int(part) for part in BENCH.discs[0].rim_colour)
     cv2.circle(picture, (round(u), round(v)), round(edge - u - 4), colour, 8)
-    assert EYE.detect(letterboxed(picture)).plate == pytest.approx(LAYOUT.plate, abs=0.01)
+    assert EYE.detect(letterboxed(picture)).plate == pytest.approx(LAYOUT.discs[0], abs=0.01)
     cv2.circle(picture, (round(u), round(v)), round(edge - u - 4), colour, cv2.FILLED)
     assert EYE.detect(letterboxed(picture)).plate is None

@@ -88,13 +88,13 @@ def test_without_a_block_it_does_not_move(monkeypatch):
     from tests.runtime.simulation.drawn_bench import drawn
 
     trial = Trial(GOOD).lay(0)
-    monkeypatch.setattr(trial, "picture", lambda: drawn(BenchLayout((), (0.1, 0.3))))
+    monkeypatch.setattr(trial, "picture", lambda: drawn(BenchLayout((), ((0.1, 0.3),))))
     assert moved(trial.ask(), trial.plant.q) < 1e-6
 
 
 def test_a_block_that_lies_on_the_plate_is_left_there():
     trial = Trial(GOOD).lay(0)
-    trial.put(*trial.table.state().plate, 0.012)
+    trial.put(*trial.table.state().discs[0], 0.012)
     assert moved(trial.ask(), trial.plant.q) < 1e-6
 
 

@@ -56,7 +56,7 @@ def test_the_legs_follow_each_other_without_a_jump_of_the_arm():
 @pytest.mark.parametrize("seed", range(20))
 def test_every_layout_is_reached_slowly_and_above_the_table(seed, q):
     layout = draw_layout(seed)
-    route = planned(q, layout.blocks[0], layout.plate)
+    route = planned(q, layout.blocks[0], layout.discs[0])
     speeds = np.abs(np.diff(route.rows, axis=0)) * RATE
     assert speeds[:, ANGLES].max() < 1.2
     accelerations = np.abs(np.diff(route.rows, n=2, axis=0)) * RATE**2
@@ -131,13 +131,13 @@ def test_arms_leave_each_other_room_wherever_block_and_plate_are(name):
     between = [all(any(part.startswith(arm) for part in pair) for arm in arms) for pair in clearance.pairs]
     for pose, seed in itertools.product(("ready", "home"), (0, 4, 6, 14)):
         layout = draw_layout(seed)
-        route = planner.pick_and_place(robot.poses[pose], layout.blocks[0], layout.plate, SURE)
+        route = planner.pick_and_place(robot.poses[pose], layout.blocks[0], layout.discs[0], SURE)
         assert clearance.distances(route.rows[::5])[:, between].min() > 0.025, (pose, seed)
 
 
 def test_an_arm_that_would_run_into_the_other_leaves_it_to_that_one():
     layout = draw_layout(4)  # the left arm is nearer to the block, but the plate is far over on the right
-    route = planned(block=layout.blocks[0], plate=layout.plate)
+    route = planned(block=layout.blocks[0], plate=layout.discs[0])
     assert route.arm is RIGHT
     assert route.legs[0].name == "reach"
 
@@ -146,7 +146,7 @@ def test_an_arm_that_is_in_the_way_of_the_only_one_that_can_makes_way_first():
     robot = robots.load_robot("arx_r5")
     layout = draw_layout(0)
     home, ready = robot.poses["home"], robot.poses["ready"]
-    route = RoutePlanner(robot, RATE, Bench()).pick_and_place(home, layout.blocks[0], layout.plate, SURE)
+    route = RoutePlanner(robot, RATE, Bench()).pick_and_place(home, layout.blocks[0], layout.discs[0], SURE)
     left, right = robot.arms
     assert route.arm is left
     first = route.legs[0]
@@ -205,7 +205,7 @@ def test_every_robot_reaches_every_layout_slowly_and_above_the_table(name):
     moving = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
     for seed in range(25):
         layout = draw_layout(seed)
-        route = planner.pick_and_place(ready, layout.blocks[0], layout.plate, SURE)
+        route = planner.pick_and_place(ready, layout.blocks[0], layout.discs[0], SURE)
         assert route is not None, seed
         assert (np.abs(np.diff(route.rows, axis=0))[:, moving].max() * RATE) < 1.5
         assert (route.rows >= robot.lower).all()
