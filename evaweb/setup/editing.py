@@ -48,6 +48,7 @@ SIZES = {
     "sides": BENCH.reach.sides,
     "reach": BENCH.reach.distance,
     "objects": {name: _size(thing) for name, thing in BENCH.objects.items()},
+    "factors": {name: factor.model_dump() for name, factor in BENCH.factors.items()},
 }
 
 # Corners of the area in 4:3 images of the simulated overhead camera, as shares of width and height: near left, near

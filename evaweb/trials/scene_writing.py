@@ -194,7 +194,11 @@ def _position_written(row: Position, values: Mapping[str, Any], place: str, prot
 
 def _bench_problem(bench: Mapping[str, Any]) -> str:
     """Return why a simulated bench would refuse this layout, "" if it would accept."""
-    return next(BENCH.problems(simulated_bench(bench) or {}), "")
+    problems = (
+        *BENCH.problems(simulated_bench(bench) or {}),
+        *BENCH.factor_problems(bench.get("factors") or {}),
+    )
+    return next(iter(problems), "")
 
 
 def _write_milestones(scene: Scene, tables: Sequence[MilestoneTable]) -> list[Fault]:

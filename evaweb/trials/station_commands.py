@@ -151,6 +151,8 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     if trial.station.simulated and trial.seed is not None:
         laid = simulated_bench(trial.position.bench)
         args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": laid}
+        if factors := (trial.position.bench or {}).get("factors"):
+            args["bench"]["factors"] = factors
     return args
 
 

@@ -80,20 +80,26 @@ def check_bench(given: object) -> None:
     """Raise ValidationError unless `given` is None or the layout of a bench.
 
     The objects of the simulated bench, such as "block": [x, y, yaw] and "plate": [x, y], are keys of their own.
-    "objects" are for benches laid out by people: name -> [x, y, yaw, width, depth]. Lengths are in metres, yaw in
-    degrees.
+    "objects" are for benches laid out by people: name -> [x, y, yaw, width, depth]. "factors" are for simulated ones:
+    name -> value. Lengths are in metres, yaw in degrees.
     """
     if given is None:
         return
     if not isinstance(given, Mapping):
         raise ValidationError(_sentence(given, f"a table such as {json.dumps(EXAMPLE)}"))
-    laid = {key: value for key, value in given.items() if key != "objects"}
-    objects = given.get("objects", {})
+    laid = {key: value for key, value in given.items() if key not in ("objects", "factors")}
+    objects, factors = given.get("objects", {}), given.get("factors", {})
+    if not isinstance(factors, Mapping):
+        raise ValidationError(_sentence(factors, 'a table such as {"light": 0.6}', "factors"))
     if not isinstance(objects, Mapping):
         raise ValidationError(
             _sentence(objects, 'a table such as {"cup": [0.1, 0.3, 0, 0.08, 0.08]}', "objects")
         )
-    problems = [*map(_place_problem, laid, laid.values()), *map(_object_problem, objects, objects.values())]
+    problems = [
+        *map(_place_problem, laid, laid.values()),
+        *map(_object_problem, objects, objects.values()),
+        *BENCH.factor_problems(factors),
+    ]
     if any(problems):
         raise ValidationError([problem for problem in problems if problem])
 
@@ -114,7 +120,7 @@ def _object_problem(name: object, value: object) -> str:
 
 def _place_problem(key: object, value: object) -> str:
     if key not in BENCH.objects:
-        return f"{key}: unknown key; allowed: {', '.join(BENCH.objects)}, objects"
+        return f"{key}: unknown key; allowed: {', '.join(BENCH.objects)}, objects, factors"
     return _numbers_problem(str(key), value, BENCH.objects[str(key)].numbers)
 
 

@@ -94,6 +94,18 @@ class Distractors(Settings):
     distance: Length = 0.1
 
 
+FactorName = Literal["light", "friction", "mass", "camera_x", "camera_y", "camera_z", "distractors"]
+
+
+class Factor(Settings):
+    """Factor of a bench that a position may change, with its bounds and the value that it has otherwise."""
+
+    title: Annotated[str, Field(min_length=1, max_length=60)]
+    usual: float
+    low: float
+    high: float
+
+
 class Milestone(Settings):
     """What the bench reports of an object."""
 
@@ -122,6 +134,9 @@ class BenchSchema(Settings):
     objects: Annotated[dict[Name, Annotated[Box | Disc, Field(discriminator="shape")]], Field(min_length=1)]
     apart: list[Apart] = Field(default_factory=list)
     distractors: Distractors = Distractors()
+    factors: dict[FactorName, Factor] = Field(default_factory=dict)
+    """light: brightness of the pictures, 1 as usual. friction, mass: times those of all surfaces, and of the blocks.
+    camera_x, camera_y, camera_z: by how much the overhead camera is moved [m]. distractors: how many."""
     together: list[Annotated[list[Name], Field(min_length=2)]] = Field(default_factory=list)
     """Objects that are placed so that one arm reaches all of them."""
     milestones: Annotated[dict[Name, Milestone], Field(min_length=1)]
@@ -135,10 +150,16 @@ class BenchSchema(Settings):
             raise SetupError(
                 f"area = {self.area}; allowed: x from, x to, y from, y to, each range increasing"
             )
-        if "objects" in self.objects:
-            raise SetupError(
-                "objects.objects: this name is that of objects laid out by people; allowed: another"
-            )
+        for name in ("objects", "factors"):
+            if name in self.objects:
+                raise SetupError(
+                    f"objects.{name}: layouts have this key for something else; allowed: another"
+                )
+        for name, factor in self.factors.items():
+            if not factor.low <= factor.usual <= factor.high:
+                raise SetupError(
+                    f"factors.{name}.usual = {factor.usual:g}; allowed: {factor.low:g} to {factor.high:g}"
+                )
         self._require_milestones()
         for names in self.together:
             if strangers := [name for name in names if name not in self.objects]:
@@ -222,6 +243,22 @@ class BenchSchema(Settings):
                 apart = math.dist(placed[one][:2], placed[other][:2])
                 if apart < least:
                     yield f"{one} and {other} are {1000 * apart:.0f} mm apart; allowed: {1000 * least:.0f} mm or more"
+
+    def factor_problems(self, factors: Mapping[str, Any]) -> Iterator[str]:
+        """Yield a sentence for each of `factors` (name -> value) that the bench does not have, or not so."""
+        for name, value in factors.items():
+            factor = self.factors.get(name)  # type: ignore[call-overload]
+            if factor is None:
+                yield f"factors.{name}: unknown factor; allowed: {', '.join(self.factors) or 'none'}"
+                continue
+            whole = name == "distractors"
+            if not is_place([value], 1) or not factor.low <= value <= factor.high or (whole and value % 1):
+                number = "a whole number" if whole else "a number"
+                yield f"factors.{name} = {value!r:.40}; allowed: {number} from {factor.low:g} to {factor.high:g}"
+
+    def factor_values(self, factors: Mapping[str, float]) -> dict[str, float]:
+        """Return the value of every factor: that of `factors`, or the usual one."""
+        return {name: float(factors.get(name, factor.usual)) for name, factor in self.factors.items()}
 
     def _place_problem(self, name: str, place: Any) -> str:
         thing = self.objects.get(name)

@@ -1,7 +1,7 @@
 """Command filter of a careful execution node: one master; targets that are fresh, finite and within limits; a deadline.
 
 Control words that switch the drives of a simulated robot (`runtime.simulation.drives`) are accepted from any client. A
-node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions`.
+node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions` and `factors`.
 """
 
 from __future__ import annotations
@@ -138,16 +138,17 @@ class CommandGate:
         return AcceptedCommand(switch=switch)
 
     def _reset(self, message: dict[Any, Any]) -> AcceptedCommand | None:
-        name, seed, positions = (message.get(key) for key in ("id", "seed", "positions"))
+        name, seed, positions, factors = (message.get(key) for key in ("id", "seed", "positions", "factors"))
         if not self._bench:
             self.refused["no_bench"] += 1
             return None
         named = isinstance(name, str) and 0 < len(name) <= _LONGEST_ID
         seeded = isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0
-        if not (named and seeded and (positions is None or isinstance(positions, dict))):
+        tables = all(table is None or isinstance(table, dict) for table in (positions, factors))
+        if not (named and seeded and tables):
             self.refused["malformed"] += 1
             return None
-        return AcceptedCommand(reset=ResetRequest(str(name), int(seed or 0), positions))
+        return AcceptedCommand(reset=ResetRequest(str(name), int(seed or 0), positions, factors))
 
     def _target(self, message: dict[Any, Any], arrival: float) -> AcceptedCommand | None:
         action = message.get("action")

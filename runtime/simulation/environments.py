@@ -102,7 +102,9 @@ class BenchEnvironment(Environment):
         They are drawn only if something has moved, because drawing is most of the work.
         """
         state = self._tabletop.state()
-        moment = np.concatenate([q, *state.discs, *(block.pose.ravel() for block in state.blocks)]).tobytes()
+        view = (state.light, *state.camera_shift)
+        poses = (block.pose.ravel() for block in state.blocks)
+        moment = np.concatenate([q, view, *state.discs, *poses]).tobytes()
         if moment != self._drawn[0]:
             self._drawn = moment, self._renderer.draw(q, state)
             for picture in self._drawn[1].values():

@@ -6,6 +6,16 @@ import { Stage } from "./stage.js";
 import { t } from "../site/sentences.js";
 
 const NUMBERS = [["x", "x mm"], ["y", "y mm"], ["yaw", t("page.positions.turn", "turn °")], ["width", t("page.positions.width", "width mm")], ["depth", t("page.positions.depth", "depth mm")]];
+// Other titles are the bench's own.
+const FACTORS = {
+  light: t("page.positions.light", "Light"),
+  friction: t("page.positions.friction", "Friction, times"),
+  mass: t("page.positions.mass", "Mass of blocks, times"),
+  camera_x: t("page.positions.camera_x", "Camera to the right, m"),
+  camera_y: t("page.positions.camera_y", "Camera away, m"),
+  camera_z: t("page.positions.camera_z", "Camera up, m"),
+  distractors: t("page.positions.distractors", "Further blocks"),
+};
 const OBJECT = [0, 0.3, 0, 0.08, 0.08]; // m, m, degrees, m, m
 
 export class Positions {
@@ -36,6 +46,7 @@ export class Positions {
     this.#part("thumbnails").addEventListener("click", (event) => this.#pressed(event));
     this.#part("position").addEventListener("input", (event) => this.#typed(event.target));
     this.#part("position").addEventListener("click", (event) => event.target.closest("[data-take-away]") && this.#taken(event.target.closest("[data-thing-row]").dataset.thingRow));
+    this.#part("factors").innerHTML = Object.entries(bench.factors).map(([key, factor]) => this.#factor(key, factor)).join("");
     for (const [id, act] of Object.entries({
       "add-position": () => this.#added(),
       "remove-position": () => this.#removed(),
@@ -128,6 +139,12 @@ export class Positions {
       if (whole) field.value = one[name];
       field.readOnly = this.#still;
     }
+    for (const field of this.#part("factors").querySelectorAll("input")) {
+      const value = one.bench?.factors?.[field.dataset.factor];
+      field.readOnly = this.#still;
+      if (field !== document.activeElement) field.value = value ?? "";
+    }
+    this.#part("factors-box").open ||= Object.keys(one.bench?.factors ?? {}).length > 0;
     for (const id of ["add-thing", "add-kind", "remove-position"]) if (this.#part(id)) this.#part(id).disabled = this.#still;
     const all = things(one.bench, this.#bench);
     const rows = this.#part("things");
@@ -155,6 +172,11 @@ export class Positions {
     return `<li class="thing-row" data-thing-row="${escaped(key)}"><span class="row spread line"><span class="strong thing-key thing-key-${look(kind, round)}">${escaped(name)}</span>${away}</span><span class="thing-numbers">${fields.join("")}</span></li>`;
   }
 
+  #factor(key, { title, usual, low, high }) {
+    const step = key === "distractors" ? 1 : "any";
+    return `<label class="field small"><span class="label">${escaped(FACTORS[key] ?? title)}</span><input type="number" data-factor="${key}" min="${low}" max="${high}" step="${step}" placeholder="${usual}"></label>`;
+  }
+
   #laid(bench) {
     this.#one.bench = bench;
     this.#numbers(false);
@@ -165,7 +187,13 @@ export class Positions {
   }
 
   #typed(field) {
-    const { position, number } = field.dataset;
+    const { position, number, factor } = field.dataset;
+    if (factor && field.validity.valid) {
+      const { [factor]: _, ...others } = this.#one.bench?.factors ?? {};
+      const factors = field.value === "" ? others : { ...others, [factor]: Number(field.value) };
+      const { factors: __, ...bench } = this.#one.bench ?? {};
+      this.#laid(Object.keys(factors).length ? { ...bench, factors } : bench);
+    }
     if (position) {
       this.#one[position] = field.value;
       this.#thumbnails();

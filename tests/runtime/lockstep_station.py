@@ -54,6 +54,7 @@ class StubRobot(Source, Sink):
         self.misread: Float64 = np.zeros(DIM)  # by how much its encoders are off
         self.told: list[tuple[str, dict[str, Any]]] = []
         self.wordless = not stubs.spec.capabilities.bench
+        self.simulates_factors = True
         self.deaf = 0  # control words that are lost on their way to it
         self.truth: dict[str, Any] | None = None
         self.drives: dict[str, Any] | None = None
@@ -88,6 +89,8 @@ class StubRobot(Source, Sink):
         self.told.append((word, dict(data)))
         if len(self.told) > self.deaf:
             self.truth = {"reset": data["id"], "seed": data["seed"], "milestones": {}, "success": False}
+            if self.simulates_factors and data.get("factors"):
+                self.truth["factors"] = data["factors"]
 
     def close(self) -> None:
         pass
@@ -177,6 +180,7 @@ def stubbed(
     absent: str = "",
     moves_robot: bool = True,
     simulated: bool = False,
+    bench: str = "tabletop",
     real: str = "",
     **settings: Any,
 ) -> Stubs:
@@ -195,7 +199,7 @@ def stubbed(
     }
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
-    can = Capabilities(moves_robot=moves_robot, bench="tabletop" if simulated else "")
+    can = Capabilities(moves_robot=moves_robot, bench=bench if simulated else "")
     spec = replace(check_deployment(loader.resolve_deployment(tree, {}, "test")), capabilities=can)
     return Stubs(spec, start, rows, space, absent, real)
 

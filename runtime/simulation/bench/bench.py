@@ -138,6 +138,10 @@ class BenchState:
 
     blocks: tuple[BlockState, ...]
     discs: tuple[tuple[float, float], ...]
+    light: float = 1.0
+    """Brightness of the pictures."""
+    camera_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """By how much the overhead camera is moved [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,20 +212,32 @@ def camera_arm(robot: Robot, camera: Camera) -> Group | None:
     return robot.arms[0] if "wrist" in camera.name and len(robot.arms) == 1 else None
 
 
-def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, PinholeCamera]:
-    """Return all cameras of the robot by key, placed for joints q [D]; a camera that no arm carries is overhead."""
+def cameras(
+    robot: Robot,
+    q: Float64,
+    width: int,
+    height: int,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> dict[str, PinholeCamera]:
+    """Return all cameras of the robot by key, placed for joints q [D].
+
+    A camera that no arm carries is overhead, moved by `shift` [m].
+    """
     carriers = {camera.key: camera_arm(robot, camera) for camera in robot.cameras}
     return {
-        key: overhead_camera(width, height)
+        key: overhead_camera(width, height, shift)
         if arm is None
         else wrist_camera(tip_in_world(robot, arm, q), width, height, place_wrist_camera(robot, arm.name))
         for key, arm in carriers.items()
     }
 
 
-def overhead_camera(width: int, height: int) -> PinholeCamera:
-    """Return the camera above the bench; arms reach into its image from below."""
+def overhead_camera(
+    width: int, height: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> PinholeCamera:
+    """Return the camera above the bench, moved by `shift` [m] without a turn; arms reach into its image from below."""
     pose = _looking(_OVERHEAD_EYE, _OVERHEAD_AIM, up=(0.0, 1.0, 0.0))
+    pose[:3, 3] += shift
     return _camera(pose, _OVERHEAD_FOCAL, width, height)
 
 

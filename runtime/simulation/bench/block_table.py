@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from runtime.benches.schema import Milestone
-from runtime.simulation.bench.bench import Bench, BenchLayout, BenchState, block_pose, yaw_of
+from runtime.simulation.bench.bench import Bench, BenchError, BenchLayout, BenchState, block_pose, yaw_of
 from runtime.simulation.bench.block import Block
 from runtime.simulation.bench.layout import draw_layout
 from runtime.simulation.bench.plant import Plant
@@ -30,10 +30,14 @@ class ResetRequest:
     id: str
     seed: int
     positions: Mapping[str, Any] | None = None
+    factors: Mapping[str, Any] | None = None
 
 
 class BlockTable(ABC):
     """Blocks and discs in front of one robot; `advance` moves the robot's plant and everything that it touches."""
+
+    unsimulated: frozenset[str] = frozenset(("friction", "mass"))
+    """Factors that have no effect here, and are refused."""
 
     def __init__(self, seed: int, blocks: int = 1, bench: Bench | None = None) -> None:
         self.bench = bench or Bench()
@@ -41,6 +45,7 @@ class BlockTable(ABC):
         self._blocks: list[Block] = []
         self._discs = np.zeros((len(self.bench.discs), 2))
         self._reached: dict[str, bool] = {}
+        self._factors: dict[str, float] = {}
         self._reset = ResetRequest("", seed)
         self._place_objects(self._reset)
 
@@ -62,7 +67,9 @@ class BlockTable(ABC):
     def state(self) -> BenchState:
         """Return the state of everything on the table, for rendering."""
         discs = tuple((float(x), float(y)) for x, y in self._discs)
-        return BenchState(tuple(block.state() for block in self._blocks), discs)
+        x, y, z = (self._factors.get(f"camera_{axis}", 0.0) for axis in "xyz")
+        light = self._factors.get("light", 1.0)
+        return BenchState(tuple(block.state() for block in self._blocks), discs, light, (x, y, z))
 
     def truth(self) -> dict[str, object]:
         """Return the ground truth for the node's observation.
@@ -81,6 +88,7 @@ class BlockTable(ABC):
             "blocks": [[*map(float, block.pose[:3, 3]), yaw_of(block.pose)] for block in self._blocks],
             "plate": discs[0],
             **({"discs": discs} if len(discs) > 1 else {}),
+            **({"factors": dict(self._reset.factors)} if self._reset.factors else {}),
             "held": [block.held_by for block in self._blocks],
             "milestones": reached,
             "success": all(self._rests(schema.milestones[name], MARGIN_M) for name in schema.success),
@@ -92,10 +100,16 @@ class BlockTable(ABC):
         Raises:
             BenchError: If it is not possible; nothing has changed then.
         """
-        return draw_layout(wish.seed, wish.positions, self._count, self.bench.schema)
+        blocks = self._count + round(self._factors.get("distractors", 0))
+        return draw_layout(wish.seed, wish.positions, blocks, self.bench.schema)
 
     def _place_objects(self, wish: ResetRequest) -> None:
-        layout = self._layout(wish)
+        before, self._factors = self._factors, self._factor_values(wish.factors or {})
+        try:
+            layout = self._layout(wish)
+        except BenchError:
+            self._factors = before
+            raise
         edges = [self.bench.edge(index) for index in range(len(layout.blocks))]
         self._blocks = [
             Block(block_pose(place, edge), edge) for place, edge in zip(layout.blocks, edges, strict=True)
@@ -103,6 +117,15 @@ class BlockTable(ABC):
         self._discs = np.array(layout.discs).reshape(-1, 2)
         schema = self.bench.schema
         self._reached = {name: False for name, milestone in schema.milestones.items() if milestone.passes}
+
+    def _factor_values(self, factors: Mapping[str, Any]) -> dict[str, float]:
+        """Return the value of every factor. Raises: BenchError if the bench does not accept one of `factors`."""
+        schema = self.bench.schema
+        if problem := next(schema.factor_problems(factors), ""):
+            raise BenchError(problem)
+        if unknown := [name for name in factors if name in self.unsimulated]:
+            raise BenchError(f"factors.{unknown[0]}: allowed on benches with contact forces alone")
+        return schema.factor_values(factors)
 
     def _note(self) -> None:
         """Update the milestones that pass."""

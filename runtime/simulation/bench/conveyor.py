@@ -126,6 +126,8 @@ class Conveyor(Tabletop):
         return min((float(np.linalg.norm(tip - place)) for tip in tips), default=math.inf)
 
     def _layout(self, wish: ResetRequest) -> BenchLayout:
+        if wish.factors:
+            raise BenchError(f"factors name {', '.join(map(str, wish.factors))}; allowed on a conveyor: none")
         if wish.positions:
             raise BenchError(
                 f"positions name {', '.join(sorted(map(str, wish.positions)))}; "

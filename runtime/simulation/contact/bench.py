@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import math
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +22,7 @@ from runtime.simulation.bench.bench import Bench
 from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.plant import Plant
 from runtime.simulation.contact.geoms import import_mujoco
-from runtime.simulation.contact.model import build_model
+from runtime.simulation.contact.model import ContactModel, build_model
 from runtime.simulation.contact.physics import PLANT_STEP, STEP, Physics
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class ContactTabletop(BlockTable):
     """
 
     step = PLANT_STEP
+    unsimulated = frozenset()
 
     def __init__(
         self,
@@ -56,15 +58,22 @@ class ContactTabletop(BlockTable):
     ) -> None:
         self._mujoco = import_mujoco()
         bench = bench or Bench()
-        self._built = build_model(robot, bench, len(bench.block_names) + blocks - 1, physics or Physics())
-        self._joints = self._built.joints
-        self._model = self._built.model
-        self._data = self._mujoco.MjData(self._model)
+        self._build = partial(build_model, robot, bench, physics=physics or Physics())
+        self._load(self._build(blocks=len(bench.block_names) + blocks - 1))
         self._measured = np.full(robot.dim, np.nan)  # joints that the plant had after the last step
         self._reference = self._measured
+        super().__init__(seed, blocks, bench)
+
+    def _load(self, built: ContactModel) -> None:
+        self._built, self._joints, self._model = built, built.joints, built.model
+        self._data = self._mujoco.MjData(self._model)
+        self._usual = (
+            self._model.geom_friction.copy(),
+            self._model.body_mass.copy(),
+            self._model.body_inertia.copy(),
+        )
         self._speed = np.zeros(len(self._joints.offsets))  # of the references, 0 of stopped joints
         self._stopped = np.zeros(len(self._joints.offsets), bool)
-        super().__init__(seed, blocks, bench)
 
     def advance(self, plant: Plant, seconds: float) -> None:
         """Advance the plant and the bench by `seconds`; what the robot touches may stop its joints."""
@@ -83,7 +92,24 @@ class ContactTabletop(BlockTable):
 
     def _place_objects(self, wish: ResetRequest) -> None:
         super()._place_objects(wish)
-        self._put_everything(self._data.qpos[self._joints.positions].copy())
+        values = self._data.qpos[self._joints.positions].copy()
+        if len(self._blocks) != len(self._built.blocks):
+            self._load(self._build(blocks=len(self._blocks)))
+        self._set_factors()
+        self._put_everything(values)
+
+    def _set_factors(self) -> None:
+        """Set friction and masses to their usual values times the factors."""
+        model = self._model
+        friction, mass, inertia = self._usual
+        model.geom_friction[:] = friction
+        sliding = friction[:, 0] * self._factors.get("friction", 1.0)
+        model.geom_friction[:, 0] = np.minimum(sliding, 1.0)
+        blocks = model.geom_bodyid[list(self._built.block_geoms)]
+        model.body_mass[:], model.body_inertia[:] = mass, inertia
+        model.body_mass[blocks] *= self._factors.get("mass", 1.0)
+        model.body_inertia[blocks] *= self._factors.get("mass", 1.0)
+        self._mujoco.mj_setConst(model, self._data)
 
     def _put_everything(self, values: Float64) -> None:
         """Put the robot's joints at `values` [n] and the objects where they were seen last; all of it at rest."""

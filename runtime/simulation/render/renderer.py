@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from robots import scene_of
@@ -52,19 +53,24 @@ class Renderer:
         light = self._shadows.cast(solids, placed, state.discs)
         painter = Painter(solids, placed)
         pictures = {}
-        for key, camera in self._cameras(q).items():
-            still = self._still.get(key)
+        usual = not any(state.camera_shift)
+        for key, camera in self._cameras(q, state.camera_shift).items():
+            still = self._still.get(key) if usual else None
             picture = self._table.draw(camera) if still is None else still.copy()
             for plate, place in zip(self._plates, state.discs, strict=True):
                 plate.draw(picture, camera, place)
             darken(picture, camera, light)
             under = camera.pose[2, 3] < 0  # camera below the table: a simulated arm can go there
             (Painter(solids, whole) if under else painter).paint(picture, camera)
+            if state.light != 1.0:
+                cv2.convertScaleAbs(picture, picture, alpha=state.light)
             pictures[key] = picture
         return pictures
 
-    def _cameras(self, q: Float64) -> dict[str, PinholeCamera]:
-        return benches.cameras(self._robot, q, *self._size)
+    def _cameras(
+        self, q: Float64, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> dict[str, PinholeCamera]:
+        return benches.cameras(self._robot, q, *self._size, shift)
 
     def _solids_of(self, blocks: int) -> Solids:
         """Return the solids for the robot's visual shapes and for `blocks` blocks.

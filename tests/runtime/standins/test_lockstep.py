@@ -200,7 +200,7 @@ def test_a_station_without_a_declared_bench_is_refused(tmp_path: Path) -> None:
 
 def test_the_bench_is_the_one_that_is_asked_for() -> None:
     arguments = [str(DEPLOYMENTS / "tabletop.toml")]
-    assert lockstep.parser().parse_args(arguments).bench == "contact"
+    assert lockstep.parser().parse_args(arguments).bench is None  # then that of the deployment's transport
     assert lockstep.parser().parse_args([*arguments, "--bench", "tabletop"]).bench == "tabletop"
     options = parser().parse_args(
         ["--robot", "ur5e", "--bench", "contact", "--width", "64", "--height", "48"]

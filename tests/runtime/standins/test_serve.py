@@ -195,7 +195,10 @@ def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--behaviour", "chase", "--noise", "5"), "for --behaviour pick_place; no other fails on purpose"),
+        (
+            ("--behaviour", "chase", "--noise", "5"),
+            "for --behaviour pick_place and sorting; no other fails on purpose",
+        ),
         (("--noise", "5"), "--noise and --failure-rate are for --behaviour pick_place"),
         (("--behaviour", "pick_place", "--failure-rate", "1.5"), "1.5 was given; allowed: 0 to 1"),
         (("--behaviour", "dance"), "invalid choice: 'dance'"),

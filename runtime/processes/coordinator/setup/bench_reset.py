@@ -29,6 +29,9 @@ _NO_LAYOUT = Pattern("bench.no_layout", "setup: bench.positions: {why}")
 _CANNOT_RESET = Pattern("bench.cannot_reset", "the bench cannot be reset: {why}")
 _NOT_RESET = Pattern("bench.not_reset", "the bench was not reset within {seconds:g} s: {why}")
 _NODE_REFUSED = Pattern("bench.node_refused", "the robot refused it ({reasons})")
+_NO_FACTORS = Pattern(
+    "bench.no_factors", "the node reset the bench without the factors ({factors}): it does not simulate them"
+)
 _NODE_SILENT = fixed("bench.node_silent", "the node does not answer to it")
 _NO_TRUTH = fixed("bench.no_truth", "the node reports no ground truth of a bench; does it simulate one?")
 
@@ -60,8 +63,9 @@ class BenchReset:
         if not self._plan.capabilities.bench:
             raise SetupError(_NOT_SIMULATED(seed=bench.seed))
         schema = load_schema(self._plan.capabilities.bench)
-        if problem := next(schema.problems(bench.positions or {}), ""):
-            raise SetupError(_NO_LAYOUT(why=problem))
+        problems = (*schema.problems(bench.positions or {}), *schema.factor_problems(bench.factors or {}))
+        if problems:
+            raise SetupError(_NO_LAYOUT(why=problems[0]))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
             raise SetupError(_RESET_ALREADY(identity=bench.id))
         return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
@@ -85,7 +89,11 @@ class BenchReset:
         Raises:
             SetupError: the reset was refused, or did not happen in time.
         """
-        if self._reception().truth.get("reset") == self._reset["id"]:
+        truth = self._reception().truth
+        if truth.get("reset") == self._reset["id"]:
+            wanted = self._reset.get("factors") or {}
+            if truth.get("factors", {}) != wanted:
+                raise SetupError(_NO_FACTORS(factors=", ".join(wanted)))
             return True
         now = self._clock.now()
         if self._refused:

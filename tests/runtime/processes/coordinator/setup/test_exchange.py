@@ -318,6 +318,28 @@ def test_a_layout_that_the_bench_does_not_accept_is_refused_before_anything_is_a
     station.close()
 
 
+def test_a_layout_has_to_fit_the_bench_of_the_transport(tmp_path: Path) -> None:
+    station = simulated(tmp_path, bench="sorting").ready(
+        bench={"seed": 1, "positions": {"red_1": [-0.21, 0.2, 0]}}
+    )
+    with pytest.raises(SetupError, match=r"bench\.positions: block: unknown object; allowed: blue_bin"):
+        station.command("setup", bench=BENCH)
+    station.close()
+
+
+def test_factors_are_asked_for_checked_and_confirmed(tmp_path: Path) -> None:
+    station = simulated(tmp_path).ready(bench={"seed": 1, "factors": {"light": 0.5}})
+    assert station.robot.told[-1][1]["factors"] == {"light": 0.5}
+    with pytest.raises(SetupError, match=r"bench\.positions: factors\.light = 9.*allowed: a number from"):
+        station.command("setup", bench={"seed": 2, "factors": {"light": 9}})
+    station.robot.simulates_factors = False
+    station.prepare(bench={"seed": 3, "factors": {"light": 0.5}})
+    assert station.reason == (
+        "the node reset the bench without the factors (light): it does not simulate them"
+    )
+    station.close()
+
+
 def test_a_bench_that_is_not_reset_in_time_ends_the_set_up(tmp_path: Path) -> None:
     station = simulated(tmp_path)
     station.robot.deaf = 1000
