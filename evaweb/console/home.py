@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
-from urllib.parse import urlencode
 
 from django.conf import settings
 from django.db.models import Q
@@ -114,10 +113,11 @@ def _work(user: Any) -> Iterator[Item]:
     for request in _requests(user):
         text = f"{request.user.get_username()} asks for {request.station}, which you command"
         yield Item(text, reverse("station-eval", args=[request.station.name]), "Answer")
-    count = unreviewed_episodes().order_by().count()
-    if count:
+    waiting = unreviewed_episodes()
+    if (first := waiting.values_list("uuid", flat=True).first()) is not None:
+        count = waiting.order_by().count()
         text = f"{count} episode{'s are' if count > 1 else ' is'} waiting for a review"
-        yield Item(text, f"{reverse('replay-list')}?{urlencode({'review': 'unreviewed'})}", "Review")
+        yield Item(text, reverse("replay", args=[first]), "Review")
 
 
 def _requests(user: Any) -> list[LeaseRequest]:

@@ -14,10 +14,18 @@ from django.views.decorators.http import require_GET, require_POST
 import robots
 from evaweb.accounts.roles import Role, require_role
 from evaweb.core.errors import EvaError
-from evaweb.datasets.bags import FOLDER, list_bags, mapping_names, read_mapping_text, save_mapping
+from evaweb.datasets.bags import (
+    bags_dir,
+    list_bags,
+    mapping_names,
+    newest_mapping_at,
+    read_mapping_text,
+    save_mapping,
+)
 from evaweb.datasets.dataset_orders import KIND
 from evaweb.datasets.overview import dataset_names
 from evaweb.datasets.views import rights_context, work_context
+from evaweb.episodes.models import Episode
 from evaweb.jobs.models import Job, JobStatus
 
 
@@ -47,15 +55,22 @@ def bag_mapping(request: HttpRequest) -> HttpResponseBase:
 
 
 def _newest_proposal() -> Job | None:
-    return Job.objects.filter(
+    """Return the newest proposal; None if there is none, or a mapping was saved since."""
+    job = Job.objects.filter(
         kind=KIND, args__what="propose", status=JobStatus.DONE, result__done=True
     ).first()
+    saved = newest_mapping_at()
+    if job is None or (saved is not None and job.finished_at is not None and saved > job.finished_at):
+        return None
+    return job
 
 
 def _context(request: HttpRequest, name: str, text: str) -> dict[str, Any]:
+    newest = Episode.objects.exclude(robot="").first()
     return {
         "bags": list_bags(),
-        "folder": FOLDER,
+        "folder": bags_dir(),
+        "robot": newest.robot if newest else "",
         "mappings": mapping_names(),
         "mapping": name,
         "text": text,

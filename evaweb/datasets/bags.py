@@ -100,6 +100,12 @@ def mapping_names() -> list[str]:
     return sorted(path.stem for path in paths if _MAPPING_NAME_FORM.fullmatch(path.stem))
 
 
+def newest_mapping_at() -> datetime | None:
+    """Return when a mapping was saved last; None if there is none."""
+    times = [_mapping_path(name).stat().st_mtime for name in mapping_names()]
+    return datetime.fromtimestamp(max(times), UTC) if times else None
+
+
 def read_mapping_text(name: str) -> str:
     """Return a saved mapping as text. Raises: NotFound, which lists the existing ones."""
     names = mapping_names()

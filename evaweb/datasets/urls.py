@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from django.urls import path
 
-from evaweb.datasets import bag_views, replay_views, views
+from evaweb.datasets import bag_views, replay_views, subset_views, views
 
 _EPISODE = "replay/datasets/<path:name>/-/<int:index>"
 
@@ -14,6 +14,8 @@ urlpatterns = [
     path("replay/datasets/-/ask", views.dataset_ask, name="dataset-ask"),
     path("replay/datasets/-/bags", bag_views.bag_list, name="bag-list"),
     path("replay/datasets/-/mapping", bag_views.bag_mapping, name="bag-mapping"),
+    path("replay/subsets/", subset_views.subsets, name="subset-list"),
+    path("replay/subsets/save", subset_views.save_subset, name="subset-save"),
     path("replay/side-by-side/", replay_views.side_by_side, name="side-by-side"),
     path("replay/on-robot/", replay_views.on_robot, name="on-robot"),
     path(f"{_EPISODE}/", replay_views.replay, name="dataset-replay"),

@@ -26,7 +26,7 @@ from evaweb.datasets import (
 )
 from evaweb.datasets.overview import overview, overviews
 from evaweb.serving.lists import Listing
-from runtime.core.sentences import Pattern
+from runtime.core.sentences import Pattern, fixed
 from runtime.datasets.__main__ import MOST, is_index
 from runtime.datasets.__main__ import episodes as indices_of
 from runtime.datasets.card import LICENCES
@@ -40,6 +40,8 @@ _NOTHING_DELETED_TYPE_NAME_DATASET = Pattern(
     "datasets.views.nothing_deleted_type_name_dataset",
     "nothing was deleted: type the name of the dataset, {name}, to confirm it",
 )
+
+_NO_BAG_CHOSEN = fixed("datasets.views.no_bag_chosen", "nothing was imported: tick at least one bag")
 
 PER_PAGE = 100
 _PAGES = {
@@ -134,7 +136,7 @@ def dataset_ask(request: HttpRequest) -> HttpResponse:
     except EvaError as error:
         messages.error(request, str(error))
     else:
-        messages.success(request, f"{dataset_jobs.summarize_job(job).title}: asked for")
+        messages.success(request, f"{dataset_jobs.summarize_job(job).title}: requested")
     if page := _PAGES.get(request.POST.get("what", "")):
         return redirect(page)
     name = request.POST.get("dataset", "")
@@ -149,6 +151,8 @@ def _order(form: QueryDict) -> Mapping[str, Any]:
         order["datasets"] = form.getlist("datasets")
     elif action == "import_bags":
         order["bags"] = form.getlist("bags")
+        if not order["bags"]:
+            raise EvaError(_NO_BAG_CHOSEN)
     elif action not in ("pull", "propose", "subset"):
         order["dataset"] = form.get("dataset", "")
     for key in _TEXTS:

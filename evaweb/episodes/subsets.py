@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+from uuid import UUID
 
 from django.core.exceptions import ValidationError
 from django.db import IntegrityError, transaction
@@ -29,17 +30,25 @@ _SEVERAL_ROBOTS = Pattern(
 )
 _NO_SUBSET = Pattern("episodes.subsets.no_subset", "there is no subset {name!r:.120}; there are: {there}")
 _NAME = Pattern("episodes.subsets.name", "name: {why}")
+_CHOSEN = Pattern("episodes.subsets.chosen", "chosen = {chosen!r:.120}; allowed: UUIDs of episodes")
 
 _NAMED = 8  # names in an error
 
 
 @transaction.atomic
 def create_subset(
-    *, user: Any, sight: Visibility, name: str, query: Mapping[str, str], description: str = ""
+    *,
+    user: Any,
+    sight: Visibility,
+    name: str,
+    query: Mapping[str, str],
+    chosen: Sequence[str] = (),
+    description: str = "",
 ) -> Subset:
-    """Keep the episodes that `query` (values of the filters of the list of episodes) finds now, under a name.
+    """Save the episodes that `query` (values of the filters of the list of episodes) finds now, under a name.
 
-    Only published episodes are kept, and none whose policy is hidden from the user.
+    With `chosen` (UUIDs), only those of them. Only published episodes are saved, and none whose policy is hidden from
+    the user.
 
     Raises:
         EvaError: The name is not allowed or taken, no episode is found, or they are of several robots.
@@ -47,7 +56,7 @@ def create_subset(
     require_role(user, Role.OPERATOR)
     if Subset.objects.filter(name=name).exists():
         raise Conflict(_THERE_ALREADY(name=name))
-    rows = [row for row in _publishable(query, sight) if not sight.hides_episode(row)]
+    rows = [row for row in _publishable(query, sight, chosen) if not sight.hides_episode(row)]
     if not rows:
         raise EvaError(_NONE_FOUND)
     robots = sorted({row.robot for row in rows})
@@ -56,7 +65,7 @@ def create_subset(
     subset = Subset(
         name=name,
         description=description,
-        query={key: value for key, value in query.items() if value},
+        query={key: value for key, value in (*query.items(), ("chosen", str(len(chosen) or ""))) if value},
         digest=_digest(str(row.uuid) for row in rows),
         created_by=user,
     )
@@ -71,8 +80,14 @@ def create_subset(
     return subset
 
 
-def _publishable(query: Mapping[str, str], sight: Visibility) -> Any:
-    return episode_list(**query, sight=sight).exclude(dataset_index=None)
+def _publishable(query: Mapping[str, str], sight: Visibility, chosen: Sequence[str]) -> Any:
+    rows = episode_list(**query, sight=sight).exclude(dataset_index=None)
+    if not chosen:
+        return rows
+    try:
+        return rows.filter(uuid__in=[UUID(uuid) for uuid in chosen])
+    except ValueError:
+        raise EvaError(_CHOSEN(chosen=", ".join(chosen))) from None
 
 
 def _digest(uuids: Iterable[str]) -> str:

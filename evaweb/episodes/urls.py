@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from django.urls import path
 
-from evaweb.episodes import subset_views, views
+from evaweb.episodes import views
 
 urlpatterns = [
     path("replay/", views.replay_list, name="replay-list"),
-    path("replay/subsets/", subset_views.subsets, name="subset-list"),
-    path("replay/subsets/save", subset_views.save_subset, name="subset-save"),
     path("replay/<uuid:uuid>/", views.replay, name="replay"),
     path("replay/<uuid:uuid>/stage", views.playback_stage, name="replay-stage"),
     path("replay/<uuid:uuid>/preview", views.preview, name="replay-preview"),

@@ -95,6 +95,7 @@ def of_labels() -> list[Entry]:
         *RESULTS,
         *VERDICTS,
         "every attempt",
+        "all",
     }
     for model in apps.get_models():
         if model.__module__.startswith("evaweb."):

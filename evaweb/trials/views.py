@@ -9,6 +9,7 @@ from uuid import uuid4
 
 from django.http import HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
+from django.utils.http import urlencode
 from django.views.decorators.http import require_GET, require_POST
 
 from evaweb.accounts.roles import Role, role_of
@@ -30,6 +31,9 @@ from evaweb.trials.record import visible_labels
 from evaweb.trials.selectors import TrialFilters
 
 PER_PAGE = 50
+
+
+_MOMENT = ("t", "from", "to", "loop")  # of the address: what is played, here and in Replay
 
 
 @require_GET
@@ -151,6 +155,7 @@ def _trial_page(
         "commands": () if hidden else selectors.commands_of(trial=trial),
         "hidden": hidden,
         "laid_out": bench_images(trial),
+        "moment": urlencode({key: request.GET[key] for key in _MOMENT if key in request.GET}),
         "further": visible_labels(trial, visibility_for_request(request)),
         "fault": fault,
         "typed": typed,

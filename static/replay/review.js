@@ -15,6 +15,7 @@ export class Review {
   #clock;
   #bar = element("review");
   #said = { flags: [], segments: [], reviews: [], covered: 0, quality: null, verdict: null };
+  #near; // note about the moment that is shown
   #noted = 0; // the row at which a note was begun
   #annotation;
   #asked = Promise.resolve(); // requests of the user, one after the other
@@ -152,6 +153,11 @@ export class Review {
     const here = element("flag-here");
     here.textContent = here.title = near ? `${near.reviewer}: ${near.note}` : (flag?.text ?? "");
     here.dataset.severity = near ? "note" : (flag?.severity ?? "");
+    if (near && near !== this.#near) {
+      const said = element("review-said");
+      said.textContent = said.title = here.title; // there is more room than beside the time
+    }
+    this.#near = near;
     showLostFrames(this.#said.flags, row);
   }
 

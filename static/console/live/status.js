@@ -77,7 +77,7 @@ function drawFigures(store, snapshot) {
   }
   const { transport } = snapshot;
   write("transport", joints !== null && joints < 1 ? t("page.status.transport_ok", "{transport} ok", { transport }) : t("page.status.transport_silent", "{transport} silent {age}", { transport, age: formatAge(joints ?? Infinity) }));
-  drawPolicy(snapshot.policy);
+  drawPolicy(snapshot.policy, snapshot.state);
   const held = { mine: t("page.status.held_you", "you"), elsewhere: t("page.status.held_elsewhere", "other page"), free: t("page.status.held_free", "free"), other: store.commander }[store.lease];
   write("lease", t("page.status.lease", "lease: {held}", { held }));
   for (const element of shown("lease")) {
@@ -102,7 +102,7 @@ function drawStage({ state_is: is, stage, reason }) {
 }
 
 /** Show the latency as a small distribution: a bar up to the 90th percentile with a mark at the median. */
-function drawPolicy(policy) {
+function drawPolicy(policy, state) {
   for (const element of shown("policy")) element.toggleAttribute("data-lost", Boolean(policy.lost));
   if (policy.lost) {
     write("policy", t("page.status.policy_lost", "policy lost, trying again"));
@@ -111,7 +111,8 @@ function drawPolicy(policy) {
   }
   const { latency_p50_ms: p50, latency_p90_ms: p90, answers } = policy;
   if (!answers || p50 === null) {
-    write("policy", t("page.status.policy_silent", "policy: no answer yet"));
+    const prepared = ["ready", "running", "holding"].includes(state); // a set-up ends with an answer
+    write("policy", prepared ? t("page.status.policy_ready", "policy ready") : t("page.status.policy_silent", "policy: no answer yet"));
     return;
   }
   const title = t("page.status.latency", "Inference latency of the last {n} answers: median {p50}, 90 % within {p90}", { n: answers, p50: formatFigure(p50, 0, "ms"), p90: formatFigure(p90, 0, "ms") });

@@ -80,6 +80,9 @@ def test_a_proposal_is_saved_and_imports_bags(operator: Client, data: Path, shel
     assert operator.post(ask, form)["Location"] == page
     job = run()
     assert (job.result["done"], job.result["episodes"], job.result["problems"]) == (True, 2, [])
+    assert "Proposal for" not in operator.get(page).content.decode()  # a mapping was saved since
+    nothing = operator.post(ask, {**form, "bags": []}, follow=True).content.decode()
+    assert "tick at least one bag" in nothing
     assert check(data / "datasets" / "cups") == []
     assert [entry.length for entry in open_dataset(data / "datasets" / "cups").episodes] == [13, 26]
     assert "Import 2 bags to cups" in operator.get(page).content.decode()

@@ -151,6 +151,13 @@ def test_pages_and_rest_keep_show_and_publish(
     page = client.post(reverse("subset-save"), form, follow=True).content.decode()
     assert "mine: 3 episodes saved" in page
     assert "status: finished" in page
+    ticked = form | {"name": "ticked", "chosen": [recordings[1], recordings[3]]}
+    page = client.post(reverse("subset-save"), ticked, follow=True).content.decode()
+    assert "ticked: 1 episodes saved" in page  # the other was never published
+    assert "chosen: 2" in page
+    Subset.objects.get(name="ticked").delete()
+    odd = client.post(reverse("subset-save"), ticked | {"chosen": "x"}, follow=True)
+    assert "allowed: UUIDs of episodes" in odd.content.decode()
     refused = client.post(reverse("subset-save"), form, follow=True)
     assert "already" in refused.content.decode()
     assert refused.redirect_chain[-1][0].endswith("?status=finished")

@@ -303,12 +303,12 @@ class SetUp:
         """Emit an event about joints that read exactly 0.
 
         A dead encoder reads 0 from the first sample on, so that only the operator can tell it from a joint that is at
-        0.
+        0. Simulated robots have no encoders.
         """
         limits = self._plan.limits
         joints = self._shared_state.observation.read()["qpos"]
         zero = [limits.names[i] for i in np.flatnonzero(limits.position_mask & (joints == 0.0))]
-        if zero and self._plan.capabilities.moves_robot:
+        if zero and self._plan.capabilities.moves_robot and not self._plan.capabilities.bench:
             text = _ZERO_JOINTS(joints=", ".join(zero))
             self._inference.pending_notes.append(Event("zero_joints", text, self._clock.now()))
 

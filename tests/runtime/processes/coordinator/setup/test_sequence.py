@@ -187,6 +187,9 @@ def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Pa
     zero = np.flatnonzero(station.spec.limits.position_mask & (standing == 0.0))
     assert named.startswith(", ".join(station.spec.limits.names[i] for i in zero) + " read exactly 0 rad")
     station.close()
+    simulated = Station(stubbed(tmp_path / "simulated", start=standing, simulated=True)).ready()
+    assert simulated.events("zero_joints") == []  # it has no encoders
+    simulated.close()
 
 
 def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:

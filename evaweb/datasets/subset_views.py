@@ -10,9 +10,9 @@ from django.urls import reverse
 from django.utils.http import urlencode
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.accounts.roles import Role, role_of
 from evaweb.blinding.visibility import visibility_for_request
 from evaweb.core.errors import EvaError
+from evaweb.datasets.views import rights_context, work_context
 from evaweb.episodes import listed
 from evaweb.episodes.subsets import create_subset, subset_list
 from evaweb.serving.lists import Listing
@@ -26,13 +26,13 @@ def subsets(request: HttpRequest) -> HttpResponseBase:
         (subset, visibility.filter_visible(subset.checkpoints.all(), "pk"))
         for subset in subset_list(sight=visibility)
     ]
-    context = {"rows": rows, "may_ask": role_of(request.user) is not Role.VIEWER}
-    return render(request, "episodes/subsets.html", context)
+    context = {"rows": rows, "name": "", **work_context(""), **rights_context(request)}
+    return render(request, "datasets/subsets.html", context)
 
 
 @require_POST
 def save_subset(request: HttpRequest) -> HttpResponseBase:
-    """Keep the episodes that the filters of the form find, under its name."""
+    """Save the episodes that the filters of the form find, or those of them that are `chosen`, under its name."""
     visibility = visibility_for_request(request)
     listing = Listing(request.POST, (), listed.filters(visibility))
     try:
@@ -44,6 +44,7 @@ def save_subset(request: HttpRequest) -> HttpResponseBase:
             name=request.POST.get("name", "").strip(),
             description=request.POST.get("description", "").strip(),
             query=listing.chosen,
+            chosen=request.POST.getlist("chosen"),
         )
     except EvaError as error:
         messages.error(request, str(error))
