@@ -6,6 +6,7 @@ Node, bench, policy server and station are the product's own, in lockstep on a v
 
 * `success.BENCH.ROBOT`: number of trials that end with the block at rest on the plate, within 40 s.
 * `success_in_poses.ROBOT`: the same number with actions in poses, with contact forces.
+* `sorted.ROBOT`: number of trials in which all five blocks of the bench `sorting` are in their bins within 120 s.
 * `tick_ms.BENCH.ROBOT`: median processor time of the robot and the bench for a tick of the control rate, without
   images. Ticks of trials are measured: the arm moves, and the block is held for about half of the time.
 * `tick_ratio.ROBOT`: quotient of the sums over all ticks, with contact forces over without.
@@ -23,10 +24,14 @@ import numpy as np
 
 from benchmarks.report import Figure, Report
 from robots import Robot
+from runtime.benches.schema import load_schema
+from runtime.simulation.bench.bench import Bench
 from runtime.simulation.bench.block_table import BlockTable
 from runtime.simulation.bench.plant import Plant
 from runtime.simulation.bench.tabletop import Tabletop
 from runtime.simulation.contact.bench import ContactTabletop
+from runtime.simulation.scripts.pick_place import Skill
+from tests.runtime.simulation.bench_trial import ROBOT, Trial
 from tests.runtime.simulation.tabletop_station import pick_and_place
 
 DEPLOYMENTS = {  # robot -> deployment with actions in joints
@@ -43,6 +48,7 @@ IN_POSES = {  # robot -> deployment, and settings that make its actions poses
     "dual_franka": ("tabletop_dual_franka", ('policy.action_space="eef"',)),
 }
 SEEDS = 20
+_SORTING = load_schema("sorting")
 
 
 def measure(seconds: float) -> Report:
@@ -64,7 +70,16 @@ def measure(seconds: float) -> Report:
     for robot, (deployment, assignments) in IN_POSES.items():
         successes = [_try(deployment, seed, "contact", [], assignments) for seed in range(SEEDS)]
         figures.append(Figure(f"success_in_poses.{robot}", sum(successes), "", f">= {0.9 * SEEDS:g}"))
+    trials = [
+        Trial(Skill(), make=_sorting, prompt=_SORTING.instruction, bench="sorting") for _ in range(SEEDS)
+    ]
+    successes = [trial.lay(seed).run(120.0).success for seed, trial in enumerate(trials)]
+    figures.append(Figure(f"sorted.{ROBOT.name}", sum(successes), "", f">= {0.9 * SEEDS:g}"))
     return Report("contact", figures, rows)
+
+
+def _sorting(robot: Robot, seed: int) -> BlockTable:
+    return ContactTabletop(robot, seed, bench=Bench(_SORTING))
 
 
 def _try(deployment: str, seed: int, bench: str, times: list[float], assignments: Sequence[str] = ()) -> bool:
