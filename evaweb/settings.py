@@ -52,6 +52,7 @@ INSTALLED_APPS = [
 
 MIDDLEWARE = [
     "evaweb.serving.headers.HeadersMiddleware",
+    "evaweb.serving.compression.CompressionMiddleware",
     "django.middleware.security.SecurityMiddleware",
     "csp.middleware.CSPMiddleware",
     "evaweb.accounts.cookies.AnySessionMiddleware",

@@ -7,7 +7,7 @@ from typing import Any
 from django.contrib.staticfiles import finders
 from django.core.checks import CheckMessage, Warning, register
 
-_WANTED = {"uplot/uPlot.esm.js": "curves", "meshcat/main.min.js": "the 3D scene"}
+_WANTED = {"uplot/uPlot.iife.min.js": "curves", "meshcat/main.min.js": "the 3D scene"}
 
 
 @register()

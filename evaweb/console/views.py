@@ -198,7 +198,7 @@ def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, 
             "result": "/preflights/",
             "newest": reverse("preflight-newest"),
         },
-        "uplot": static("uplot/uPlot.esm.js"),
+        "uplot": static("uplot/uPlot.iife.min.js"),
         "beat": static("console/commands/beat.js"),
     }
 

@@ -18,7 +18,7 @@ _ROW_EPISODE_HAS_ROWS_0 = Pattern(
     "row {first}: the episode has rows 0 to {frames}",
 )
 
-MOST_ROWS = 900  # rows per response: half a minute at 30 Hz
+MOST_ROWS = 150  # rows per response: 5 s at 30 Hz
 
 
 def pose_message(folder: Path, first: int) -> bytes:

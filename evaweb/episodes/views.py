@@ -148,7 +148,7 @@ def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 def player() -> dict[str, Any]:
     """Return the scripts that every page with a player needs."""
-    return {"viewer": static("meshcat/main.min.js"), "uplot": static("uplot/uPlot.esm.js")}
+    return {"viewer": static("meshcat/main.min.js"), "uplot": static("uplot/uPlot.iife.min.js")}
 
 
 def replay_config(episode: Episode) -> dict[str, Any]:

@@ -12,11 +12,12 @@ import hashlib
 import mimetypes
 import re
 import time
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import brotli
 from django.core.exceptions import SuspiciousFileOperation
 
 from evaweb.serving.headers import DEFAULT_HEADERS
@@ -24,8 +25,11 @@ from evaweb.serving.headers import DEFAULT_HEADERS
 _PREFIX = "/static/"
 _DIGEST = re.compile(r"([0-9a-f]{16})/")
 _KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".json": "application/json"}
-_SMALL = 64 * 1024  # largest file that is compressed in the event loop [bytes]; others in a thread
 _KEPT, _ASKED = b"max-age=31536000, public, immutable", b"max-age=0, public"
+_ENCODINGS: Mapping[bytes, Callable[[bytes], bytes]] = {  # the first that a browser accepts is used
+    b"br": lambda content: brotli.compress(content, quality=11),
+    b"gzip": lambda content: gzip.compress(content, 6, mtime=0),
+}
 _POLICY = b"default-src 'self'"  # for scripts that run as workers
 
 
@@ -44,14 +48,14 @@ class _File:
     """File that is ready for sending.
 
     Attributes:
-        packed: Content compressed with gzip, empty if the compression does not shrink it.
+        packed: Compressed content by encoding, without those that do not shrink it.
         tag: Entity tag.
         changed: Modification time. If it is later than the start of this process, the content may differ from that
             for which the digest in the URL stands.
     """
 
     content: bytes
-    packed: bytes
+    packed: Mapping[bytes, bytes]
     headers: list[tuple[bytes, bytes]]
     tag: bytes
     changed: float
@@ -86,11 +90,7 @@ class StaticFiles:
             return cached
         if (path := _found(name)) is None:
             return None
-        content = path.read_bytes()
-        if len(content) > _SMALL:
-            file = await asyncio.to_thread(_made, path, content)
-        else:
-            file = _made(path, content)
+        file = await asyncio.to_thread(_made, path)
         if self._digest:
             self._files[name] = file
         return file
@@ -106,29 +106,32 @@ def _found(name: str) -> Path | None:
     return Path(path) if isinstance(path, str) and Path(path).is_file() else None
 
 
-def _made(path: Path, content: bytes) -> _File:
+def _made(path: Path) -> _File:
+    content = path.read_bytes()
     kind = _KINDS.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     text = kind.startswith("text/") or kind in _KINDS.values()
-    packed = gzip.compress(content, 6, mtime=0) if text else b""
+    packed = {name: pack(content) for name, pack in _ENCODINGS.items()} if text else {}
+    packed = {name: shorter for name, shorter in packed.items() if len(shorter) < len(content)}
     headers = [
         (b"content-type", f"{kind}; charset=utf-8".encode() if text else kind.encode()),
         (b"vary", b"Accept-Encoding"),
     ]
     tag = b'"%s"' % hashlib.sha256(content).hexdigest()[:32].encode()
-    return _File(content, packed if len(packed) < len(content) else b"", headers, tag, path.stat().st_mtime)
+    return _File(content, packed, headers, tag, path.stat().st_mtime)
 
 
 async def _answer(scope: dict[str, Any], send: Any, file: _File, keeping: bytes) -> None:
     request_headers = dict(scope["headers"])
-    packs = bool(file.packed) and b"gzip" in request_headers.get(b"accept-encoding", b"")
-    tag = file.tag[:-1] + b'-gzip"' if packs else file.tag
+    accepted = {part.strip() for part in request_headers.get(b"accept-encoding", b"").split(b",")}
+    encoding = next((name for name in file.packed if name in accepted), b"")
+    tag = b'%s-%s"' % (file.tag[:-1], encoding) if encoding else file.tag
     headers = [*file.headers, (b"cache-control", keeping), (b"etag", tag)]
     if tag in request_headers.get(b"if-none-match", b""):
         await _send(send, 304, headers)
         return
-    content = file.packed if packs else file.content
-    if packs:
-        headers.append((b"content-encoding", b"gzip"))
+    content = file.packed[encoding] if encoding else file.content
+    if encoding:
+        headers.append((b"content-encoding", encoding))
     headers.append((b"content-length", b"%d" % len(content)))
     await _send(send, 200, headers, content if scope["method"] == "GET" else b"")
 

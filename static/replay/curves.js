@@ -3,6 +3,7 @@
 import { Legend } from "../console/curves/curve_legend.js";
 import { lastNotAbove } from "../site/binary_search.js";
 import { t } from "../site/sentences.js";
+import { loadPlots } from "../site/uplot.js";
 import { Chunks } from "./chunks.js";
 import { CurveCell } from "./curve_cell.js";
 import { joint, message } from "./data.js";
@@ -19,7 +20,7 @@ export async function curvePane({ clock, address, uplot }) {
   try {
     const { header, numbers } = await message(address);
     const episode = read(header, numbers);
-    const library = (await import(uplot).catch(() => null))?.default;
+    const library = await loadPlots(uplot);
     if (library) new Pane(clock, episode, library);
     note.hidden = Boolean(library);
     note.textContent = library ? "" : t("page.replay.no_uplot", "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.");

@@ -2,6 +2,7 @@
 
 import { jointOptions } from "../console/manual/joint_names.js";
 import { t } from "../site/sentences.js";
+import { loadPlots } from "../site/uplot.js";
 import { cameras } from "./cameras.js";
 import { Clock, Shifted } from "./clock.js";
 import { message } from "./data.js";
@@ -64,7 +65,7 @@ const KEY = `eva-beside-joint:${given.getAll("show").join()}`; // key of the joi
 const SAMPLES = 400; // number of times at which the episodes are compared
 
 async function curves() {
-  const library = (await import(config.uplot).catch(() => null))?.default;
+  const library = await loadPlots(config.uplot);
   if (!library) throw new Error(t("page.beside.no_uplot", "uPlot is not installed: run make setup and start the lab again"));
   const read = await Promise.all(episodes.map(async (episode) => ({ ...episode, ...(await message(episode.curves)) })));
   const marks = read.flatMap(({ header, shift, number }) => header.marks.map((mark) => ({ ...mark, time: mark.time + shift, text: `${number}: ${mark.text || mark.kind}` })));

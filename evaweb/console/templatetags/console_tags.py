@@ -1,4 +1,4 @@
-"""Template tags of every page's bar: tabs, and the user's role."""
+"""Template tags of every page's bar (tabs, the user's role), and of the wall."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from django.urls import reverse
 
 from evaweb.accounts.roles import role_of
 from evaweb.console import selectors
+from evaweb.console.home import alarms
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,12 @@ register = template.Library()
 def tab_bar(context: template.Context) -> dict[str, Any]:
     """Render the tabs; the one to which this address belongs is marked as current."""
     return {"tabs": page_tabs(context["request"]), "request": context["request"]}
+
+
+@register.inclusion_tag("console/alarms.html", takes_context=True)
+def lab_alarms(context: template.Context) -> dict[str, Any]:
+    """Render the current alarms of the whole lab."""
+    return {"now": {"alarms": list(alarms())}, "request": context["request"]}
 
 
 @register.simple_tag

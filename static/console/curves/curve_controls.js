@@ -10,16 +10,15 @@ import { MarkLegend } from "./mark_legend.js";
 import { Tags } from "../scene/tags.js";
 import { formatDuration } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
+import { loadPlots } from "../../site/uplot.js";
 
 const KEY = `eva-joint-${config.station}`;
 
 /** Make the pane of the curves; resolve to {add(samples), joints(names, units, grippers)}. */
 export async function curvePane(store) {
   const note = document.getElementById("curves-note");
-  let library;
-  try {
-    library = (await import(config.uplot)).default;
-  } catch {
+  const library = await loadPlots(config.uplot);
+  if (!library) {
     note.hidden = false;
     note.textContent = t("page.curves.no_library", "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.");
     return { add() {}, joints() {} };

@@ -17,7 +17,7 @@ def test_scripts_that_are_absent_are_warned_of_with_what_brings_them(monkeypatch
     monkeypatch.setattr(checks.finders, "find", lambda name: None if "uplot" in name else name)
     (warning,) = [found for found in run_checks() if found.id and found.id.startswith("console.")]
     assert warning.id == "console.W001"
-    assert warning.msg == "uplot/uPlot.esm.js is absent: pages are shown without curves"
+    assert warning.msg == "uplot/uPlot.iife.min.js is absent: pages are shown without curves"
     assert warning.hint == "make setup brings it"
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import gzip
 
+import brotli
 import pytest
 from django.conf import settings
 from django.templatetags.static import static
@@ -42,10 +43,15 @@ def test_what_a_page_names_is_kept_for_good_and_packed(ask):
     assert said["cache-control"] == "max-age=31536000, public, immutable"
     assert said["content-security-policy"] == "default-src 'self'"
     assert said["x-content-type-options"] == "nosniff"
-    status, packed, small = ask(address, accept_encoding="br, gzip")
-    assert (packed["content-encoding"], gzip.decompress(small)) == ("gzip", content)
-    assert len(small) == int(packed["content-length"]) < len(content) / 2
-    assert packed["etag"] != said["etag"]
+    unpacking = {"br": brotli.decompress, "gzip": gzip.decompress}
+    tags = {said["etag"]}
+    for accepted, used in (("gzip, deflate, br", "br"), ("gzip;q=0.5, gzip", "gzip")):
+        status, packed, small = ask(address, accept_encoding=accepted)
+        assert (packed["content-encoding"], unpacking[used](small)) == (used, content)
+        assert len(small) == int(packed["content-length"]) < len(content) / 2
+        tags.add(packed["etag"])
+    assert len(tags) == 3
+    assert "content-encoding" not in ask(address, accept_encoding="gzip;q=0, identity")[1]
     assert ask(address, if_none_match=said["etag"])[::2] == (304, b"")
     assert ask(address, "HEAD")[::2] == (200, b"")
 

@@ -325,6 +325,11 @@ def test_lab_and_wall_name_no_checkpoint_of_a_blind_plan(plan, bench, carry_out,
     assert "success" not in client.get("/result/lab/", HTTP_HX_REQUEST="true").content.decode()
 
 
+def test_the_wall_comes_with_its_alarms(bench, as_):
+    text = as_(bench.operator).get("/result/wall/").content.decode()
+    assert "Needs attention" in text  # what came later would push all the rest down
+
+
 def test_queries_do_not_grow_with_trials(plan, owner, carry_out, as_):
     client = as_(owner)
     client.post(f"{PLAN}look")
