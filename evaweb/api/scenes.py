@@ -45,6 +45,7 @@ class SceneOut(Schema):
     instruction: str
     criterion: str
     layout: str
+    bench: str
     time_limit_s: float | None
     ordered: bool
     failure_required: bool

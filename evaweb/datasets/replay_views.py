@@ -152,7 +152,7 @@ def geometry_json(request: HttpRequest, name: str, index: int) -> HttpResponse:
     episode = _episode(request, name, index)
     recording = _or_conflict(lambda: as_recording(episode))
     robot = drawn_robot_for(recording.manifest).robot
-    return JsonResponse(scene_geometry(robot.name, [group.name for group in robot.groups], simulated=False))
+    return JsonResponse(scene_geometry(robot.name, [group.name for group in robot.groups]))
 
 
 @require_GET

@@ -10,7 +10,7 @@ from typing import Any
 
 from evaweb.episodes.models import EpisodeStatus
 from runtime.recording.files import RecordingError, read_json
-from runtime.recording.layout import Layout, simulated
+from runtime.recording.layout import Layout, simulated_bench
 from runtime.recording.outcome_seal import (
     MANIFEST,
     OUTCOME,
@@ -70,7 +70,7 @@ def read_recorded_episode(folder: Path) -> RecordedEpisode:
     return RecordedEpisode(
         uuid=layout.uuid,
         station=_text(manifest, "station", 63),
-        simulated=simulated(manifest),
+        simulated=bool(simulated_bench(manifest)),
         trial=_table(manifest, "trial"),
         ended_at=_time(outcome.get("ended_wall")),
         facts=facts | _end(path, outcome),

@@ -37,7 +37,7 @@ from evaweb.stations.geometry import scene_geometry
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError, read_json
-from runtime.recording.layout import simulated
+from runtime.recording.layout import simulated_bench
 
 _SHOWN_EXPORTS = ("table", "mcap-video", "mcap-image-h264")  # JPEG is for programs that know neither
 
@@ -237,7 +237,7 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
         raise Conflict(str(error)) from None
     robot = drawn_robot_for(manifest).robot
     groups = [group.name for group in robot.groups]
-    return JsonResponse(scene_geometry(robot.name, groups, simulated=simulated(manifest)))
+    return JsonResponse(scene_geometry(robot.name, groups, bench=simulated_bench(manifest)))
 
 
 @require_GET

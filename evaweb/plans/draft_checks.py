@@ -16,7 +16,8 @@ from evaweb.plans.schedule import Condition, check_schedule
 from evaweb.statistics.difference import barnard
 from evaweb.statistics.planning import approximate_power
 from evaweb.trials.models import Milestone, Scene
-from evaweb.trials.tables import TRUTHS, check_strategy
+from evaweb.trials.tables import check_strategy
+from runtime.benches.schema import UnusableBench
 
 _ENOUGH = 20  # pairs that, if all are won by one checkpoint, are significant at any alpha allowed
 _GAIN = (0.5, 0.7)  # success rates whose difference a plan should find
@@ -202,14 +203,26 @@ def thoughts(plan: Plan) -> Iterator[Remark]:
         yield Remark("conditions", f"Station {station} is switched off.")
     if few := _finds_nothing(plan) or _finds_little(plan):
         yield Remark("design", few)
-    odd = Milestone.objects.filter(scene__positions__plan=plan).exclude(truth__in=("", *TRUTHS)).distinct()
-    for milestone in odd:
-        yield Remark(
-            "conditions",
-            f"Milestone “{milestone}” of scene {milestone.scene} is what a bench reports as “{milestone.truth}”: "
-            f"simulated benches of ours report {', '.join(TRUTHS)}.",
-        )
+    yield from _unreported(plan)
     if not plan.blind:
         yield Remark("design", "The plan is open: operators see which checkpoint runs, and may favour one.")
     if not plan.second_rater_share:
         yield Remark("design", "No trial is scored a second time: how well raters agree is not known.")
+
+
+def _unreported(plan: Plan) -> Iterator[Remark]:
+    """Yield a remark for each milestone that the simulated bench of its scene does not report."""
+    told = Milestone.objects.filter(scene__positions__plan=plan).exclude(truth="").select_related("scene")
+    for milestone in told.distinct():
+        scene = milestone.scene
+        try:
+            reported = scene.schema.milestones
+        except UnusableBench as error:
+            yield Remark("conditions", f"Scene {scene}: {error}.")
+            continue
+        if milestone.truth not in reported:
+            yield Remark(
+                "conditions",
+                f"Milestone “{milestone}” of scene {scene} is what a bench reports as “{milestone.truth}”: "
+                f"the simulated bench {scene.bench} reports {', '.join(reported)}.",
+            )

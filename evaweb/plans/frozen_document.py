@@ -15,6 +15,7 @@ from evaweb.plans.schedule import PAIRED, Condition, Unit, counts_of, schedule
 from evaweb.statistics.boundaries import MOST, SHAPES
 from evaweb.statistics.designs import boundary_table
 from evaweb.trials.models import Checkpoint, Position, Scene
+from runtime.benches.schema import DEFAULT_BENCH
 from runtime.core.sentences import Pattern
 
 _RANDOM_ORDER_TWO_CHECKPOINTS_CAME = Pattern(
@@ -125,6 +126,8 @@ def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
         "instruction": scene.instruction,
         "criterion": scene.criterion,
         "layout": scene.layout,
+        # The default is left out: digests of plans frozen before there were several benches stay the same.
+        **({"bench": scene.bench} if scene.bench != DEFAULT_BENCH else {}),
         "time_limit_s": scene.time_limit_s,
         "ordered": scene.ordered,
         "positions": [

@@ -1,6 +1,6 @@
 """Import and export of scenes, checkpoints and plans as TOML, for exchange between labs.
 
-    [[scene]]       name, title, instruction, criterion, layout, time_limit_s, ordered, failure_required
+    [[scene]]       name, title, instruction, criterion, layout, bench, time_limit_s, ordered, failure_required
     [[scene.position]]   number, label, description, bench
     [[scene.milestone]]  order, text, points, required, time_limit_s, truth
     [[checkpoint]]  name, description, policy, digest, parent (a name), recipe, tags, strategy, anchor
@@ -118,6 +118,7 @@ def _written(
 
 def _scene_table(scene: Scene) -> dict[str, Any]:
     table = scene_of(scene, list(scene.positions.order_by("number")))
+    table["bench"] = scene.bench
     table["failure_required"] = scene.failure_required  # a rule for raters, not part of a frozen plan
     table["position"], table["milestone"] = table.pop("positions"), table.pop("milestones")
     return table

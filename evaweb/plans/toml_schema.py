@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from evaweb.plans.region_matching import Region
+from runtime.benches.schema import DEFAULT_BENCH
 
 _Name = Annotated[str, Field(min_length=1, max_length=120)]
 
@@ -47,6 +48,7 @@ class SceneTable(Table):
     instruction: str
     criterion: str = ""
     layout: str = ""
+    bench: str = DEFAULT_BENCH
     time_limit_s: float | None = None
     ordered: bool = False
     failure_required: bool = False

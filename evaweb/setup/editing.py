@@ -9,6 +9,7 @@ from django.http import HttpRequest
 from django.template.loader import render_to_string
 from django.urls import reverse
 
+from evaweb.core.errors import EvaError
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.plans.models import Reference
 from evaweb.stations.models import Station
@@ -25,12 +26,23 @@ from evaweb.trials.scene_reading import (
     scene_table,
 )
 from evaweb.trials.scene_writing import table_of
-from evaweb.trials.tables import BENCH, EXAMPLE
-from runtime.benches.schema import Box, Disc
+from evaweb.trials.tables import example_layout
+from runtime.benches.schema import (
+    DEFAULT_BENCH,
+    BenchSchema,
+    Box,
+    Disc,
+    UnusableBench,
+    installed_benches,
+    load_schema,
+)
 
 
-def _size(thing: Box | Disc) -> dict[str, Any]:
-    """Return how an object of the simulated bench is drawn from above: lengths in m."""
+def _size(thing: Box | Disc, *, coloured: bool) -> dict[str, Any]:
+    """Return how an object of the simulated bench is drawn from above: lengths in m.
+
+    Its own colour is drawn if `coloured`.
+    """
     width, depth = thing.size[:2] if isinstance(thing, Box) else (2 * thing.radius, 2 * thing.radius)
     return {
         "title": thing.title,
@@ -38,18 +50,38 @@ def _size(thing: Box | Disc) -> dict[str, Any]:
         "width": width,
         "depth": depth,
         "example": thing.example,
+        "colour": "#{:02x}{:02x}{:02x}".format(*thing.colour) if coloured else "",
     }
 
 
-# The simulated bench, with lengths in m, and position and reach of its arms.
-SIZES = {
-    "area": BENCH.area,
-    "apart": BENCH.distances,
-    "sides": BENCH.reach.sides,
-    "reach": BENCH.reach.distance,
-    "objects": {name: _size(thing) for name, thing in BENCH.objects.items()},
-    "factors": {name: factor.model_dump() for name, factor in BENCH.factors.items()},
-}
+def sizes_of(schema: BenchSchema) -> dict[str, Any]:
+    """Return a simulated bench as it is drawn and edited: lengths in m, position and reach of its arms.
+
+    Where several boxes or discs have to be told apart, they have their own colours, else those of the page.
+    """
+    coloured = len(schema.boxes) > 1 or len(schema.discs) > 1
+    return {
+        "area": schema.area,
+        "apart": schema.distances,
+        "sides": schema.reach.sides,
+        "reach": schema.reach.distance,
+        "objects": {name: _size(thing, coloured=coloured) for name, thing in schema.objects.items()},
+        "factors": {name: factor.model_dump() for name, factor in schema.factors.items()},
+    }
+
+
+def _drawn(scene: Scene) -> tuple[BenchSchema, dict[str, Any], str]:
+    """Return the scene's bench, how it is drawn, and "".
+
+    If its folder is absent or invalid, return the default bench without objects, and the reason: the scene can still
+    be looked at, and its bench corrected.
+    """
+    try:
+        return scene.schema, sizes_of(scene.schema), ""
+    except UnusableBench as error:
+        schema = load_schema(DEFAULT_BENCH)
+        return schema, sizes_of(schema) | {"objects": {}, "factors": {}, "apart": []}, str(error)
+
 
 # Corners of the area in 4:3 images of the simulated overhead camera, as shares of width and height: near left, near
 # right, far right, far left. A test compares them with the simulation.
@@ -68,7 +100,7 @@ def shown(scene: Scene) -> dict[str, Any]:
         }
         for row in scene.positions.all()
     ]
-    return {"title": scene.title, "bench": SIZES, "positions": positions}
+    return {"title": scene.title, "bench": _drawn(scene)[1], "positions": positions}
 
 
 def state_of(scene: Scene) -> dict[str, Any]:
@@ -78,46 +110,93 @@ def state_of(scene: Scene) -> dict[str, Any]:
 
 def existing(scene: Scene) -> dict[str, Any]:
     """Return the context of the editor for an existing scene."""
-    state = {**state_of(scene), "references": _references(scene), **_around()}
+    schema, sizes, problem = _drawn(scene)
+    state = {**state_of(scene), "references": _references(scene), "bench": sizes, **_around(schema)}
     return {
         "scene": scene,
+        "bench": scene.bench,
+        "bench_problem": problem,
+        "truths": _truths(scene.bench, schema),
         "state": state,
         "trials": scene.trials.count(),
         "plans": running_plans(scene),
     }
 
 
-def new(source: Scene | None) -> dict[str, Any]:
-    """Return the context of the editor for a new scene, as a copy of `source` if given."""
+def new(source: Scene | None, bench: str = "") -> dict[str, Any]:
+    """Return the context of the editor for a new scene, as a copy of `source` if given.
+
+    A scene for the simulated bench `bench` begins with that bench's task; "" is the default bench, without a task.
+    Raises: EvaError if there is no such bench.
+    """
+    name = source.bench if source else bench or DEFAULT_BENCH
+    try:
+        schema = load_schema(name)
+    except UnusableBench as error:
+        raise EvaError(str(error)) from None
     table = scene_table(source) if source else SceneTable().model_dump()
     table["name"] = ""
     table["title"] = f"{source.title} (copy)" if source else ""
     for row in (*table["positions"], *table["milestones"]):
         row["id"] = None
+    table["bench"] = name
     if source is None:
-        laid = EXAMPLE if station_list().filter(simulated=True).exists() else None
+        simulated = bench or station_list().filter(simulated=True).exists()
+        laid = example_layout(schema) if simulated else None
         table["positions"] = [PositionTable(number=1, bench=laid).model_dump()]
-    state = {"scene": table, "seen": "", "kept": {}, "references": {}, **_around()}
-    return {"scene": None, "source": source, "state": state, "trials": 0, "plans": []}
+    if source is None and bench:
+        table["title"], table["instruction"] = schema.title, schema.instruction
+        rows = {truth: schema.milestones[truth] for truth in schema.success}
+        table["milestones"] = [
+            MilestoneTable(text=row.text, required=True, truth=truth).model_dump()
+            for truth, row in rows.items()
+        ]
+    around = {"bench": sizes_of(schema), **_around(schema)}
+    state = {"scene": table, "seen": "", "kept": {}, "references": {}, **around}
+    return {
+        "scene": None,
+        "source": source,
+        "bench": name,
+        "benches": known_benches(),
+        "truths": _truths(name, schema),
+        "state": state,
+        "trials": 0,
+        "plans": [],
+    }
 
 
-def _around() -> dict[str, Any]:
+def known_benches() -> list[str]:
+    """Return the installed benches, then those of scenes, each once."""
+    used = Scene.objects.order_by("bench").values_list("bench", flat=True).distinct()
+    return list(dict.fromkeys([*installed_benches(), *used]))
+
+
+def _truths(bench: str, schema: BenchSchema) -> list[tuple[str, str]]:
+    """Return (name, text) of what a bench reports; of the default bench, whose texts the page has itself, nothing."""
+    if bench == DEFAULT_BENCH:
+        return []
+    return [(name, milestone.text) for name, milestone in schema.milestones.items()]
+
+
+def _around(schema: BenchSchema) -> dict[str, Any]:
     stations = [
-        {"name": row.name, "title": str(row), "cameras": cameras_of(row), "corners": _corners(row)}
+        {"name": row.name, "title": str(row), "cameras": cameras_of(row), "corners": _corners(row, schema)}
         for row in station_list()
     ]
     addresses = {
         "preview": reverse("setup-preview"),
         "live": reverse("setup-live", args=["STATION", "CAMERA"]),
     }
-    return {"bench": SIZES, "stations": stations, "addresses": addresses}
+    return {"stations": stations, "addresses": addresses}
 
 
-def _corners(station: Station) -> dict[str, Any]:
+def _corners(station: Station, schema: BenchSchema) -> dict[str, Any]:
     """Return, for each camera known to look from above, the corners of the bench's area in its image.
 
-    They are shares of the image's width and height.
+    They are shares of the image's width and height, and known for benches with the default bench's area alone.
     """
+    if schema.area != load_schema(DEFAULT_BENCH).area:
+        return {}
     above = [camera for camera in cameras_of(station) if station.simulated and "wrist" not in camera]
     return dict.fromkeys(above, OVERHEAD)
 

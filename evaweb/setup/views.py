@@ -50,12 +50,16 @@ def scenes(request: HttpRequest) -> HttpResponse:
 
 @require_http_methods(["GET", "POST"])
 def new_scene(request: HttpRequest) -> HttpResponse:
-    """Render the editor for a new scene, or for a copy of the scene in ?from=; write a posted scene."""
+    """Render the editor for a new scene, or for a copy of the scene in ?from=; write a posted scene.
+
+    ?bench= is the simulated bench of a new scene, whose task it begins with.
+    """
     require_role(request.user, Role.ADMIN)
     if request.method == "POST":
         return _written(request, None)
     source = request.GET.get("from", "")
-    return _editor(request, editing.new(scene_get(name=source) if source else None))
+    bench = request.GET.get("bench", "")
+    return _editor(request, editing.new(scene_get(name=source) if source else None, bench))
 
 
 @require_http_methods(["GET", "POST"])

@@ -11,18 +11,20 @@ from numpy.typing import NDArray
 
 from evaweb.stations.meshes import mesh_in
 from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot, tip_of
-from evaweb.stations.surroundings import BENCH, scene_surroundings
+from evaweb.stations.surroundings import scene_surroundings
 from robots import Group
 from robots.capsules import capsules
 from robots.rotations import transform_of
 from robots.shapes import PLAIN
 from robots.visuals import Visual
+from runtime.benches.looks import looks_of
+from runtime.benches.schema import UnusableBench, load_schema
 
 Float64 = NDArray[np.float64]
 
 
-def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, simulated: bool) -> dict[str, Any]:
-    """Return parts, shapes, frames and surroundings of a robot with these groups.
+def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, bench: str = "") -> dict[str, Any]:
+    """Return parts, shapes, frames and surroundings of a robot with these groups, and the objects of a simulated bench.
 
     Matrices are column-major. In a frame, key "part" is None if the frame is fixed in the scene.
     Raises: NotFound for an unknown robot or group.
@@ -41,8 +43,16 @@ def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, simulated
         "frames": _frames(drawn),
         "capsules": _capsules(drawn),
         **scene_surroundings(drawn),
-        "bench": BENCH if simulated else None,
+        "bench": _bench(bench) if bench else None,
     }
+
+
+def _bench(name: str) -> dict[str, Any] | None:
+    """Return how the bench's objects look, None if its folder is not on this machine: they are not drawn then."""
+    try:
+        return looks_of(load_schema(name))
+    except UnusableBench:
+        return None
 
 
 def _visual(robot: str, visual: Visual) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Surroundings of a robot in the scene: table, floor, mounts, and the direction from robot to table.
 
-The scene is that of the simulated bench: z = 0 is the surface of the table, objects lie within BENCH's `area`. A robot
+The scene is that of the default bench: z = 0 is the surface of the table, objects lie within its `area`. A robot
 whose body reaches below the table stands on a floor, and the table is cut so that it does not touch the body.
 """
 
@@ -15,33 +15,16 @@ from numpy.typing import NDArray
 from evaweb.stations.robot_geometry import DrawnRobot
 from robots import urdf
 from robots.visuals import Visual
+from runtime.benches.looks import shade
 from runtime.benches.schema import load_schema
 
 Float64 = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # x from, to, y from, y to [m]
 
 _TABLETOP = load_schema("tabletop")
-_BLOCK, _PLATE = _TABLETOP.box("block"), _TABLETOP.disc("plate")
-
-
-def _shade(parts: Sequence[int]) -> list[float]:
-    """Return an opaque colour with parts from 0 to 1."""
-    return [*(part / 255 for part in parts), 1.0]
-
-
 _X_FROM, _X_TO, _Y_FROM, _Y_TO = _TABLETOP.area
 AREA: Rectangle = (_X_FROM, _X_TO, _Y_FROM, _Y_TO)  # area for objects
-# The simulated bench: lengths [m], colours from 0 to 1.
-BENCH = {
-    "block_edge": _BLOCK.size[0],
-    "plate_radius": _PLATE.radius,
-    "plate_height": _PLATE.height,
-    "area": _TABLETOP.area,
-    "plate_colour": _shade(_PLATE.colour),
-    "plate_rim_colour": _shade(_PLATE.rim_colour),
-    "block_colours": [_shade(colour) for colour in (_BLOCK.colour, *_TABLETOP.distractors.colours)],
-}
-_WOOD = _shade(_TABLETOP.table_colour)
+_WOOD = shade(_TABLETOP.table_colour)
 _STEEL = [96 / 255, 102 / 255, 110 / 255, 1.0]
 _THICKNESS = 0.03
 _LEAST_TABLE: Rectangle = (-0.6, 0.6, -0.2, 0.6)  # AREA with a margin

@@ -8,6 +8,7 @@ from django.views.decorators.http import condition, require_safe
 from evaweb.core.errors import NotFound
 from evaweb.stations import geometry, meshes
 from evaweb.stations.selectors import station_get
+from runtime.benches.schema import DEFAULT_BENCH
 
 _A_YEAR = 365 * 24 * 3600
 
@@ -16,11 +17,14 @@ _A_YEAR = 365 * 24 * 3600
 def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
     """Return the scene of a station as JSON.
 
+    A runtime that says how the objects of its simulated bench look overrides "bench".
+
     The query ?groups=a,b selects the joint groups with which the robot is drawn: those that its runtime reports.
     """
     try:
         station = station_get(name=name)
-        document = geometry.scene_geometry(station.robot, _groups(request), simulated=station.simulated)
+        bench = DEFAULT_BENCH if station.simulated else ""
+        document = geometry.scene_geometry(station.robot, _groups(request), bench=bench)
     except NotFound as error:
         raise Http404(str(error)) from None
     return JsonResponse(document)
@@ -33,7 +37,7 @@ def robot_geometry(request: HttpRequest, robot: str) -> JsonResponse:
     The robot is drawn with the joint groups in ?groups=a,b; without this query, with all groups that are not optional.
     """
     try:
-        return JsonResponse(geometry.scene_geometry(robot, _groups(request), simulated=False))
+        return JsonResponse(geometry.scene_geometry(robot, _groups(request)))
     except NotFound as error:
         raise Http404(str(error)) from None
 

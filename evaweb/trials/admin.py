@@ -201,7 +201,10 @@ class SceneAdmin(ActiveActions, LogsValues):
     formfield_overrides = _SHORT
     fieldsets = (
         (None, {"fields": (("title", "name"), "instruction", "active")}),
-        ("At the bench", {"fields": ("layout", "criterion", "time_limit_s", "ordered", "failure_required")}),
+        (
+            "At the bench",
+            {"fields": ("layout", "bench", "criterion", "time_limit_s", "ordered", "failure_required")},
+        ),
     )
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Scene]:

@@ -16,7 +16,16 @@ from evaweb.episodes.models import Episode, Subset
 from evaweb.records.append_only import AppendOnly
 from evaweb.stations.models import Station
 from evaweb.trials.failure_text import failure_text
-from evaweb.trials.tables import check_bench, check_policy, check_strategy, check_tags, check_term
+from evaweb.trials.tables import (
+    check_bench,
+    check_bench_name,
+    check_policy,
+    check_strategy,
+    check_tags,
+    check_term,
+    layout_problems,
+)
+from runtime.benches.schema import DEFAULT_BENCH, BenchSchema, UnusableBench, load_schema
 
 
 class Scene(models.Model):
@@ -29,6 +38,13 @@ class Scene(models.Model):
         blank=True, help_text="When is it a success? Written down before the first trial."
     )
     layout = models.TextField(blank=True, help_text="How to lay out the bench before each trial.")
+    bench = models.CharField(
+        "simulated bench",
+        max_length=200,
+        default=DEFAULT_BENCH,
+        validators=[check_bench_name],
+        help_text="Whose objects positions lay out: a bench that comes with the program, or its folder's path.",
+    )
     time_limit_s = models.FloatField(
         "time limit [s]",
         null=True,
@@ -53,6 +69,11 @@ class Scene(models.Model):
     def __str__(self) -> str:
         return self.title
 
+    @property
+    def schema(self) -> BenchSchema:
+        """Schema of the simulated bench. Raises: UnusableBench if its folder is absent or invalid."""
+        return load_schema(self.bench)
+
 
 class Position(models.Model):
     """Initial condition of a scene, by number."""
@@ -74,6 +95,17 @@ class Position(models.Model):
 
     def __str__(self) -> str:
         return f"{self.number}" + (f" · {self.label}" if self.label else "")
+
+    def clean(self) -> None:
+        """Require that the layout consists of objects and factors of the scene's bench."""
+        if not isinstance(self.bench, dict):
+            return  # none, or refused by the field's own validator
+        try:
+            problems = layout_problems(self.bench, self.scene.schema)
+        except UnusableBench as error:
+            problems = [str(error)]
+        if problems:
+            raise ValidationError({"bench": problems})
 
 
 class Milestone(models.Model):

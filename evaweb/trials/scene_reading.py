@@ -13,10 +13,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from evaweb.serving.error_pages import is_text
 from evaweb.trials.models import Scene
+from runtime.benches.schema import DEFAULT_BENCH
 
 _FROZEN = ("frozen", "closed", "revealed")  # states of plans; evaweb.plans defines the relation
 FIELDS = (
-    *("title", "instruction", "criterion", "layout"),
+    *("title", "instruction", "criterion", "layout", "bench"),
     *("time_limit_s", "ordered", "failure_required", "active"),
 )
 POSITION = ("number", "label", "description", "bench")
@@ -65,6 +66,7 @@ class SceneTable(_Table):
     instruction: _Text = ""
     criterion: _Text = ""
     layout: _Text = ""
+    bench: _Text = DEFAULT_BENCH
     time_limit_s: float | None = None
     ordered: bool = False
     failure_required: bool = False

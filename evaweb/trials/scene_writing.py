@@ -34,7 +34,7 @@ from evaweb.trials.scene_reading import (
     scene_table,
     values_of,
 )
-from evaweb.trials.tables import BENCH, check_milestones, simulated_bench
+from evaweb.trials.tables import check_milestones, simulated_bench
 from runtime.core.sentences import Pattern
 
 _SCENE_DOES_NOT_EXIST_ANY = Pattern(
@@ -109,7 +109,9 @@ def scene_write(
     if faults:
         raise SceneRefused(faults)
     scene.save()
-    faults = [*_write_positions(scene, table.positions), *_write_milestones(scene, table.milestones)]
+    other_bench = before is not None and before["bench"] != scene.bench
+    faults = _write_positions(scene, table.positions, check_all=other_bench)
+    faults += _write_milestones(scene, table.milestones)
     if faults:
         raise SceneRefused(faults)
     after = scene_table(scene)
@@ -154,7 +156,7 @@ def _assigned(scene: Scene, table: SceneTable) -> list[Fault]:
     return faults
 
 
-def _write_positions(scene: Scene, tables: Sequence[PositionTable]) -> list[Fault]:
+def _write_positions(scene: Scene, tables: Sequence[PositionTable], *, check_all: bool) -> list[Fault]:
     rows = {row.pk: row for row in scene.positions.all()}
     protected = protected_positions(scene)
     faults = [*_strangers(tables, rows, "positions"), *_twice(tables)]
@@ -170,7 +172,7 @@ def _write_positions(scene: Scene, tables: Sequence[PositionTable]) -> list[Faul
     for index, table in enumerate(tables):
         row = rows[table.id] if table.id else Position(scene=scene)
         values = table.model_dump(include=set(POSITION))
-        if not table.id or _plain(values_of(row, POSITION)) != _plain(values):
+        if check_all or not table.id or _plain(values_of(row, POSITION)) != _plain(values):
             faults += _position_written(row, values, f"positions.{index}", protected.get(row.pk, ""))
     return faults
 
@@ -185,20 +187,16 @@ def _position_written(row: Position, values: Mapping[str, Any], place: str, prot
     for name, value in values.items():
         setattr(row, name, value)
     faults = _faults(row, f"{place}.", label)
-    if not faults and (problem := _bench_problem(row.bench or {})):
+    if not faults and (problem := _bench_problem(row)):
         faults = [Fault(f"{place}.bench", f"{label}: {problem}")]
     if not faults:
         row.save()
     return faults
 
 
-def _bench_problem(bench: Mapping[str, Any]) -> str:
-    """Return why a simulated bench would refuse this layout, "" if it would accept."""
-    problems = (
-        *BENCH.problems(simulated_bench(bench) or {}),
-        *BENCH.factor_problems(bench.get("factors") or {}),
-    )
-    return next(iter(problems), "")
+def _bench_problem(row: Position) -> str:
+    """Return why the scene's simulated bench would refuse this layout, "" if it would accept."""
+    return next(row.scene.schema.problems(simulated_bench(row.bench) or {}), "")
 
 
 def _write_milestones(scene: Scene, tables: Sequence[MilestoneTable]) -> list[Fault]:

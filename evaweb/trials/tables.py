@@ -14,12 +14,11 @@ import pydantic
 from django.core.exceptions import ValidationError
 
 from evaweb.trials.failure_text import is_unspecified
-from runtime.benches.schema import load_schema
+from runtime.benches.schema import DEFAULT_BENCH, BenchSchema, UnusableBench, load_schema
 from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
-BENCH = load_schema("tabletop")  # the simulated bench that positions are laid out for
-EXAMPLE = {name: thing.example for name, thing in BENCH.objects.items()}
+_OTHER_KEYS = ("objects", "factors")  # keys of a layout that are no objects of a simulated bench
 _OBJECT_NAME = re.compile(r"[^\W_](?:[\w .-]{0,38}[\w.-])?")
 _SMALLEST, _LARGEST = 0.005, 1.0  # side of an object [m]
 _OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
@@ -56,7 +55,12 @@ def check_tags(given: object) -> None:
         raise ValidationError(_sentence(given, "each tag once"))
 
 
-TRUTHS = tuple(BENCH.milestones)  # milestones that the simulated bench reports
+def check_bench_name(given: str) -> None:
+    """Raise ValidationError unless `given` is an installed bench or the path of a bench's folder."""
+    try:
+        load_schema(given)
+    except UnusableBench as error:
+        raise ValidationError(str(error)) from None
 
 
 def check_term(given: str) -> None:
@@ -77,17 +81,18 @@ def check_milestones(texts: Sequence[str]) -> None:
 
 
 def check_bench(given: object) -> None:
-    """Raise ValidationError unless `given` is None or the layout of a bench.
+    """Raise ValidationError unless `given` is None or the layout of some bench.
 
-    The objects of the simulated bench, such as "block": [x, y, yaw] and "plate": [x, y], are keys of their own.
+    The objects of a simulated bench, such as "block": [x, y, yaw] and "plate": [x, y], are keys of their own.
     "objects" are for benches laid out by people: name -> [x, y, yaw, width, depth]. "factors" are for simulated ones:
-    name -> value. Lengths are in metres, yaw in degrees.
+    name -> value. Lengths are in metres, yaw in degrees. `layout_problems` compares it with one simulated bench.
     """
     if given is None:
         return
     if not isinstance(given, Mapping):
-        raise ValidationError(_sentence(given, f"a table such as {json.dumps(EXAMPLE)}"))
-    laid = {key: value for key, value in given.items() if key not in ("objects", "factors")}
+        raise ValidationError(
+            _sentence(given, f"a table such as {json.dumps(example_layout(load_schema(DEFAULT_BENCH)))}")
+        )
     objects, factors = given.get("objects", {}), given.get("factors", {})
     if not isinstance(factors, Mapping):
         raise ValidationError(_sentence(factors, 'a table such as {"light": 0.6}', "factors"))
@@ -95,18 +100,31 @@ def check_bench(given: object) -> None:
         raise ValidationError(
             _sentence(objects, 'a table such as {"cup": [0.1, 0.3, 0, 0.08, 0.08]}', "objects")
         )
-    problems = [
-        *map(_place_problem, laid, laid.values()),
-        *map(_object_problem, objects, objects.values()),
-        *BENCH.factor_problems(factors),
-    ]
-    if any(problems):
-        raise ValidationError([problem for problem in problems if problem])
+    problems = [problem for problem in map(_object_problem, objects, objects.values()) if problem]
+    if problems:
+        raise ValidationError(problems)
+
+
+def layout_problems(given: Mapping[str, Any], schema: BenchSchema) -> list[str]:
+    """Return a sentence for each object or factor of a layout that this simulated bench does not have, or not so.
+
+    Places outside its area are allowed: people may lay out the same position on a real bench.
+    """
+    laid = simulated_bench(given) or {}
+    places = [_place_problem(key, value, schema) for key, value in laid.items()]
+    factors = given.get("factors")
+    odd = schema.factor_problems(factors) if isinstance(factors, Mapping) else ()
+    return [problem for problem in (*places, *odd) if problem]
+
+
+def example_layout(schema: BenchSchema) -> dict[str, Any]:
+    """Return a layout with every object of a simulated bench at the place that its schema proposes."""
+    return {name: list(thing.example) for name, thing in schema.objects.items()}
 
 
 def simulated_bench(given: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return the part of a position's layout that a simulated bench can reset itself."""
-    return None if given is None else {key: given[key] for key in BENCH.objects if key in given}
+    return None if given is None else {key: at for key, at in given.items() if key not in _OTHER_KEYS}
 
 
 def _object_problem(name: object, value: object) -> str:
@@ -118,10 +136,10 @@ def _object_problem(name: object, value: object) -> str:
     return problem
 
 
-def _place_problem(key: object, value: object) -> str:
-    if key not in BENCH.objects:
-        return f"{key}: unknown key; allowed: {', '.join(BENCH.objects)}, objects, factors"
-    return _numbers_problem(str(key), value, BENCH.objects[str(key)].numbers)
+def _place_problem(key: str, value: object, schema: BenchSchema) -> str:
+    if key not in schema.objects:
+        return f"{key}: unknown key; allowed: {', '.join((*schema.objects, *_OTHER_KEYS))}"
+    return _numbers_problem(key, value, schema.objects[key].numbers)
 
 
 def _numbers_problem(key: str, value: object, parts: Sequence[str]) -> str:

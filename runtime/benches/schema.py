@@ -17,12 +17,18 @@ from runtime.core.settings import Settings, explain_validation_error
 
 FOLDER = Path(__file__).parent
 FILE = "bench.toml"
+DEFAULT_BENCH = "tabletop"
+"""Bench of configurations, scenes and recordings that name none."""
 
 Part = Annotated[int, Field(ge=0, le=255)]
 Colour = Annotated[list[Part], Field(min_length=3, max_length=3)]
 Length = Annotated[float, Field(gt=0, le=2)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 _NUMBERS = ("x", "y", "yaw in degrees")
+
+
+class UnusableBench(SetupError):
+    """Error for a bench whose folder is absent, or whose file is invalid."""
 
 
 class _Placed(Settings):
@@ -301,7 +307,7 @@ def load_schema(bench: str) -> BenchSchema:
     """Return the schema of a bench: the name of one that comes with the program, or the path of its folder.
 
     Raises:
-        SetupError: If there is none, or its file is invalid.
+        UnusableBench: If there is none, or its file is invalid.
     """
     folder = FOLDER / bench if bench in installed_benches() else Path(bench).expanduser()
     file = folder / FILE
@@ -309,12 +315,12 @@ def load_schema(bench: str) -> BenchSchema:
         tree = tomllib.loads(file.read_text(encoding="utf-8"))
         return BenchSchema.model_validate(tree)
     except FileNotFoundError:
-        raise SetupError(
+        raise UnusableBench(
             f"bench {bench!r} has no {FILE}; allowed: {', '.join(installed_benches())}, or the path of a bench's folder"
         ) from None
     except SetupError as error:
-        raise SetupError(f"{file}: {error}") from error
+        raise UnusableBench(f"{file}: {error}") from error
     except ValidationError as invalid:
-        raise SetupError(explain_validation_error(invalid, BenchSchema, tree, str(file))) from invalid
+        raise UnusableBench(explain_validation_error(invalid, BenchSchema, tree, str(file))) from invalid
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SetupError(f"{file}: {error}") from error
+        raise UnusableBench(f"{file}: {error}") from error

@@ -31,7 +31,7 @@ from runtime.datasets.stats import Statistic, video_statistic
 from runtime.recording.base import IMPORTED
 from runtime.recording.export import export_table
 from runtime.recording.labels import latest_label
-from runtime.recording.layout import simulated
+from runtime.recording.layout import simulated_bench
 from runtime.recording.scrub import require_intact
 
 if TYPE_CHECKING:
@@ -263,7 +263,7 @@ def _eva(
         "frames": journal.frames,
         "task": journal.task,
         **{key: manifest[key] for key in keys if key in manifest},
-        "simulated": simulated(manifest),
+        "simulated": bool(simulated_bench(manifest)),
         "outcome": dict(journal.outcome),
         "success": success,
         "result": result,

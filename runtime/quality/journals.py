@@ -26,7 +26,7 @@ from runtime.quality.block import (
 from runtime.quality.frame_stream import FrameStream, VideoFrameStream
 from runtime.quality.report import Severity
 from runtime.recording.files import read_json
-from runtime.recording.layout import Layout, simulated
+from runtime.recording.layout import Layout, simulated_bench
 from runtime.recording.outcome_seal import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.scrub import verify_episode
 from runtime.recording.tables import added, rows_schema
@@ -54,7 +54,7 @@ class JournalSource(EpisodeSource):
         self.frames, self.remarks = self._outcome()
         self.cameras = dict(self._layout.cameras)
         self.schema = _table(self._manifest, "collection")
-        self.drawn = simulated(self._manifest)
+        self.drawn = bool(simulated_bench(self._manifest))
         self.vectors = {name: self._vector(name) for name in ("qpos", "action", *self._layout.streams)}
 
     def _outcome(self) -> tuple[int | None, list[tuple[str, Severity, str]]]:

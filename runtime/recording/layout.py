@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from runtime.benches.schema import DEFAULT_BENCH
 from runtime.core.errors import RecordingError
 
 VECTOR_STREAMS = ("qvel", "effort", "eef", "eef_action")
@@ -126,8 +127,12 @@ def _captured(size: Mapping[str, object]) -> tuple[int, int]:
     return _count(size, names[0]), _count(size, names[1])
 
 
-def simulated(manifest: Mapping[str, Any]) -> bool:
-    """Return True if the episode's deployment declares a simulated bench, so that its pictures are rendered."""
+def simulated_bench(manifest: Mapping[str, Any]) -> str:
+    """Return the simulated bench that the episode's deployment declares, whose pictures are rendered; "" if none."""
     configuration = manifest.get("configuration")
     transport = configuration.get("transport") if isinstance(configuration, Mapping) else None
-    return isinstance(transport, Mapping) and transport.get("simulated") is True
+    if not isinstance(transport, Mapping) or transport.get("simulated") is not True:
+        return ""
+    return str(
+        transport.get("bench", DEFAULT_BENCH)
+    )  # recordings from before there were several do not name it

@@ -35,6 +35,7 @@ class Editor {
     if (draft) this.#tell(t("page.scene.restored", "Your unsaved changes are restored."), "pressed");
     if (sessionStorage.getItem(SAVED) === location.pathname) this.#tell(t("page.scene.saved", "Saved."), "accepted");
     sessionStorage.removeItem(SAVED);
+    document.getElementById("bench")?.addEventListener("change", ({ target }) => this.#otherBench(target.value.trim()));
     document.getElementById("discard").addEventListener("click", () => this.#discard());
     this.#form.addEventListener("input", (event) => this.#typed(event.target));
     this.#save?.addEventListener("click", () => this.#sent());
@@ -84,6 +85,13 @@ class Editor {
     const other = JSON.stringify(this.scene) !== this.#saved;
     document.getElementById("unsaved").hidden = !other;
     document.getElementById("discard").hidden = !other;
+  }
+
+  /** Begin again with the task of another simulated bench. */
+  #otherBench(name) {
+    const address = new URL(location.href);
+    address.searchParams.set("bench", name);
+    location.assign(address);
   }
 
   #discard() {

@@ -1,6 +1,6 @@
 // The robot in 3D with meshcat's viewer script: the shapes are sent once, then one matrix per part and frame.
 
-import { block, ground, mount, plate, table } from "./scene_bench.js";
+import { block, disc, ground, mount, table } from "./scene_bench.js";
 import { Capsules } from "./scene_capsules.js";
 import { ChunkDots } from "./scene_chunk.js";
 import { Frames } from "./scene_frames.js";
@@ -30,7 +30,8 @@ export class Scene3D {
   #dots = new ChunkDots();
   #preview = new Preview();
   #blocks = [];
-  #plate = null;
+  #discs = [];
+  #looks = null; // of the objects that are drawn
   #lies = "";
   #geometry = null;
   #shown = { ghost: false, frames: false, path: true, chunk: true, capsules: false };
@@ -57,8 +58,7 @@ export class Scene3D {
   show(geometry) {
     for (const path of OURS) this.#viewer.delete_path([path]);
     this.#geometry = geometry;
-    this.#blocks = [];
-    this.#plate = null;
+    this.#clearBench();
     this.#drawn = new Float32Array(0);
     this.#framed = false;
     this.#preview.end();
@@ -82,21 +82,37 @@ export class Scene3D {
     this.#viewer.set_dirty();
   }
 
-  /** Place the objects on a simulated bench: {blocks: [[x, y, z, yaw]], plate: [x, y]}. */
-  setBench({ blocks = [], plate: at }) {
-    const bench = this.#geometry?.bench;
-    if (!bench || !Array.isArray(at)) return;
-    const lies = JSON.stringify([blocks, at]);
-    if (this.#plate && lies === this.#lies) return; // already drawn like this
+  #clearBench() {
+    this.#blocks.forEach((_, index) => this.#viewer.delete_path(["bench", `block${index}`]));
+    this.#discs.forEach((_, index) => this.#viewer.delete_path(["bench", `disc${index}`]));
+    this.#blocks = [];
+    this.#discs = [];
+    this.#lies = "";
+  }
+
+  /**
+   * Place the objects on a simulated bench: {blocks: [[x, y, z, yaw]], plate: [x, y]}, or {blocks, discs: [[x, y]]} with several
+   * discs. `looks` says how they look, as runtime.benches.looks; without it, the geometry does.
+   */
+  setBench({ blocks = [], plate, discs = Array.isArray(plate) ? [plate] : [] }, looks = this.#geometry?.bench) {
+    if (!looks || !this.#geometry || !discs.length) return;
+    if (looks !== this.#looks) {
+      this.#clearBench();
+      this.#looks = looks;
+    }
+    const lies = JSON.stringify([blocks, discs]);
+    if (lies === this.#lies) return; // already drawn like this
     this.#lies = lies;
-    this.#plate ??= this.#add("bench/plate", plate(bench));
-    this.#plate.position.set(at[0], at[1], 0);
+    discs.forEach(([x, y], index) => {
+      this.#discs[index] ??= this.#add(`bench/disc${index}`, disc(looks.discs[index % looks.discs.length]));
+      this.#discs[index].position.set(x, y, 0);
+    });
     while (this.#blocks.length > blocks.length) {
       this.#blocks.pop();
       this.#viewer.delete_path(["bench", `block${this.#blocks.length}`]);
     }
     blocks.forEach(([x, y, z, yaw], index) => {
-      this.#blocks[index] ??= this.#add(`bench/block${index}`, block(bench, index));
+      this.#blocks[index] ??= this.#add(`bench/block${index}`, block(looks.blocks[index % looks.blocks.length]));
       this.#blocks[index].position.set(x, y, z);
       this.#blocks[index].rotation.set(0, 0, yaw);
     });

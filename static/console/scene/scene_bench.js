@@ -1,4 +1,4 @@
-// The surroundings of the robot: table, mounts and ground, and on a simulated bench plate and blocks. Metres, z up.
+// The surroundings of the robot: table, mounts and ground, and on a simulated bench discs and blocks. Metres, z up.
 
 import { css } from "../live/style.js";
 import { material, shape, three } from "./scene_shapes.js";
@@ -52,8 +52,8 @@ export function ground(floor) {
   return grid;
 }
 
-/** Return a flat plate centred on its own origin, standing on z = 0. */
-export function plate({ plate_radius: radius, plate_height: height, plate_colour: colour, plate_rim_colour: rim }) {
+/** Return a flat disc centred on its own origin, standing on z = 0. */
+export function disc({ radius, height, colour, rim }) {
   const THREE = three();
   const group = new THREE.Group();
   const dish = new THREE.Mesh(shape("cylinder", [radius * 0.86, height]), material(colour));
@@ -64,7 +64,7 @@ export function plate({ plate_radius: radius, plate_height: height, plate_colour
   return group;
 }
 
-/** Return block number `index`, centred on its own origin. */
-export function block({ block_edge: edge, block_colours: colours }, index) {
-  return new (three().Mesh)(shape("box", [edge, edge, edge]), material(colours[index % colours.length]));
+/** Return a block centred on its own origin. */
+export function block({ size, colour }) {
+  return new (three().Mesh)(shape("box", size), material(colour));
 }

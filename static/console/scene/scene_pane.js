@@ -37,7 +37,7 @@ export async function scenePane(store) {
         scene.setPoses(numbers, count);
         name();
       },
-      bench: (truth) => scene.setBench(truth),
+      bench: (truth) => scene.setBench(truth, store.snapshot?.facts?.bench ?? undefined),
       chunk: (chunk) => shown.take(chunk),
       software: scene.software,
     };

@@ -54,7 +54,7 @@ def test_dots_are_where_the_robots_fingertips_would_be():
     frame, _ = shown(content)
     tips = frame.array("chunk", "tips")
     assert tips.shape == (16, 2, 3)
-    for arm, tip in enumerate(scene_geometry("agilex_piper", simulated=False)["tips"]):
+    for arm, tip in enumerate(scene_geometry("agilex_piper")["tips"]):
         part = LOOKS.poses(content["rows"][5])[tip["part"]].reshape(4, 4).T
         assert np.allclose(tips[5, arm], (part @ np.reshape(tip["pose"], (4, 4)).T)[:3, 3], atol=1e-6)
 

@@ -6,13 +6,15 @@ from typing import Any
 
 import pytest
 
-from evaweb.setup.editing import SIZES
+from evaweb.setup.editing import sizes_of
+from runtime.benches.schema import load_schema
 from tests.evaweb.console.test_modules import pytestmark, run
 
 __all__ = ["pytestmark"]
 BENCH, GENERATE, PLANE = ("../setup/bench.js", "../setup/generate.js", "../setup/plane.js")
 LAID = {"block": [-0.14, 0.26, 20], "plate": [0.08, 0.34]}
 AREA = [-220, 220, 180, 400]
+SIZES = sizes_of(load_schema("tabletop"))
 
 
 def call(module: str, name: str, *given: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from evaweb.plans.models import Reference
 from evaweb.setup.editing import OVERHEAD
 from evaweb.stations.models import Station
 from evaweb.trials.models import FailureTerm, Scene
-from evaweb.trials.tables import EXAMPLE
+from evaweb.trials.tables import example_layout
+from runtime.benches.schema import FOLDER, load_schema
 from runtime.simulation.bench.bench import Bench, overhead_camera
 from tests.evaweb.trials import builders
 
@@ -78,8 +80,46 @@ def test_a_new_scene_of_a_lab_with_a_simulated_bench_has_its_block_and_plate(cli
     live.simulated = True
     live.save()
     given = state(client, alma, reverse("setup-new-scene"))
-    assert given["scene"]["positions"][0]["bench"] == EXAMPLE
+    assert given["scene"]["positions"][0]["bench"] == example_layout(load_schema("tabletop"))
     assert given["stations"][0]["corners"]["cam_high"] == OVERHEAD
+
+
+def test_a_new_scene_for_another_bench_begins_with_its_task_and_is_saved(client, alma, to):
+    given = state(client, alma, reverse("setup-new-scene") + "?bench=sorting")
+    assert set(given["bench"]["objects"]) == set(given["scene"]["positions"][0]["bench"])
+    assert len(given["scene"]["milestones"]) == 5
+    whole = {**given["scene"], "name": "sorting"}
+    assert to("setup-new-scene", {"scene": whole}).status_code == 200
+    page = client.get(reverse("setup-scene", args=["sorting"]))
+    assert "Red block 1 rests in the blue bin" in page.content.decode()
+    assert page.context["state"]["bench"]["objects"]["red_1"]["colour"] == "#e24a16"
+
+
+def test_an_unknown_bench_is_refused_and_a_lost_one_is_named(client, alma, to, scene, tmp_path):
+    client.force_login(alma)
+    assert client.get(reverse("setup-new-scene") + "?bench=moon").status_code == 400
+    bench = tmp_path / "own"
+    shutil.copytree(FOLDER / "tabletop", bench)
+    Scene.objects.update(bench=str(bench))
+    shutil.rmtree(bench)
+    load_schema.cache_clear()
+    page = client.get(reverse("setup-scene", args=[scene.name]))
+    assert f"bench &#x27;{bench}&#x27; has no bench.toml" in page.content.decode()
+    assert client.get(reverse("setup-scenes")).status_code == 200
+
+
+def test_positions_are_compared_with_the_bench_that_a_scene_is_changed_to(client, alma, to, scene):
+    scene.positions.update(bench={"block": [0.0, 0.3, 0]})
+    given = state(client, alma, reverse("setup-scene", args=[scene.name]))
+    answer = to(
+        "setup-scene", {"scene": {**given["scene"], "bench": "sorting"}, "seen": given["seen"]}, scene.name
+    )
+    assert answer.status_code == 400
+    assert "block: unknown key; allowed: blue_bin" in answer.json()["faults"][0]["text"]
+    answer = to(
+        "setup-scene", {"scene": {**given["scene"], "bench": "moon"}, "seen": given["seen"]}, scene.name
+    )
+    assert [fault["place"] for fault in answer.json()["faults"]] == ["bench"]
 
 
 def test_a_copy_is_of_no_trial_and_of_no_plan(client, alma, to, bench):

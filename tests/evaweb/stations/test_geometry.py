@@ -12,12 +12,13 @@ from evaweb.core.errors import NotFound
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import drawn_robot
-from evaweb.stations.surroundings import BENCH
+from runtime.benches.looks import looks_of
+from runtime.benches.schema import load_schema
 
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
-    found = scene_geometry(name, simulated=False)
+    found = scene_geometry(name)
     assert json.loads(json.dumps(found)) == found
     assert len(found["home"]) == len(found["parts"])
     parts = range(len(found["parts"]))
@@ -30,7 +31,7 @@ def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
     looks = drawn_robot(name)
-    frames = scene_geometry(name, simulated=False)["frames"]
+    frames = scene_geometry(name)["frames"]
     ends = [frame for frame in frames if frame["kind"] == "end"]
     for frame, arm in zip(ends, looks.robot.arms, strict=True):
         assert frame["name"].removeprefix(f"{arm.name}/") == arm.eef_link
@@ -43,7 +44,7 @@ def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_a_pose_of_an_arm_leads_from_its_frame_to_its_end_effector(name):
     looks = drawn_robot(name)
-    frames = scene_geometry(name, simulated=False)["frames"]
+    frames = scene_geometry(name)["frames"]
     q = np.asarray(looks.robot.poses["home"])
     parts = looks.scene.poses(q)
     for frame, arm in zip(frames, looks.robot.arms, strict=False):
@@ -53,19 +54,17 @@ def test_a_pose_of_an_arm_leads_from_its_frame_to_its_end_effector(name):
 
 def test_the_frame_of_all_mounts_stands_still():
     robot = drawn_robot("dual_franka").robot
-    (stand,) = [
-        one for one in scene_geometry("dual_franka", simulated=False)["frames"] if one["part"] is None
-    ]
+    (stand,) = [one for one in scene_geometry("dual_franka")["frames"] if one["part"] is None]
     assert stand["name"] == robot.mount_frame
     assert np.allclose(stand["pose"][12:15], robot.stand[:3])
 
 
 def test_fewer_groups_are_fewer_parts():
-    one = scene_geometry("agilex_piper", ["left_arm"], simulated=False)
+    one = scene_geometry("agilex_piper", ["left_arm"])
     assert one["groups"] == ["left_arm"]
-    assert len(one["parts"]) == len(scene_geometry("agilex_piper", simulated=False)["parts"]) / 2
+    assert len(one["parts"]) == len(scene_geometry("agilex_piper")["parts"]) / 2
     with pytest.raises(NotFound, match="tail"):
-        scene_geometry("agilex_piper", ["tail"], simulated=False)
+        scene_geometry("agilex_piper", ["tail"])
 
 
 @pytest.mark.django_db
@@ -73,7 +72,7 @@ def test_pages_fetch_it_by_station_and_by_robot(client, django_user_model):
     Station.objects.create(name="bench-9", robot="agilex_piper", simulated=True)
     assert client.get("/stations/bench-9/geometry").status_code == 302
     client.force_login(django_user_model.objects.create_user("ann"))
-    assert client.get("/stations/bench-9/geometry").json()["bench"] == BENCH
+    assert client.get("/stations/bench-9/geometry").json()["bench"] == looks_of(load_schema("tabletop"))
     assert client.get("/stations/bench-9/geometry?groups=right_arm").json()["groups"] == ["right_arm"]
     assert client.get("/robots/agilex_piper/geometry").json()["bench"] is None
     for address in (

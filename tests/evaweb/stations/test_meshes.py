@@ -41,7 +41,7 @@ def meshed(tmp_path, monkeypatch):
 
 
 def shown(name="meshed"):
-    return [visual for visual in scene_geometry(name, simulated=False)["visuals"] if visual["kind"] == "mesh"]
+    return [visual for visual in scene_geometry(name)["visuals"] if visual["kind"] == "mesh"]
 
 
 def test_a_mesh_has_an_address_and_a_box_that_stands_for_it(meshed):

@@ -1,7 +1,15 @@
 import pytest
 from django.core.exceptions import ValidationError
 
-from evaweb.trials.tables import check_bench, check_policy, check_strategy, simulated_bench
+from evaweb.trials.tables import (
+    check_bench,
+    check_bench_name,
+    check_policy,
+    check_strategy,
+    layout_problems,
+    simulated_bench,
+)
+from runtime.benches.schema import load_schema
 
 KEY = "-----BEGIN OPENSSH PRIVATE KEY-----\nc2VjcmV0\n"
 
@@ -91,13 +99,6 @@ def test_benches_that_can_be_pass(bench):
     ("bench", "sentence"),
     [
         ([1], "allowed: a table such as"),
-        ({"cup": [0, 0]}, "cup: unknown key; allowed: plate, block, objects"),
-        ({"block": [0, 0]}, "block = [0, 0]; allowed: 3 numbers: [x, y, yaw in degrees]"),
-        ({"plate": [0, "a"]}, "allowed: 2 numbers"),
-        ({"plate": [0, True]}, "allowed: 2 numbers"),
-        ({"plate": [0, float("nan")]}, "allowed: 2 numbers"),
-        ({"plate": 3}, "allowed: 2 numbers"),
-        ({"plate": [300, 0]}, "at most 2 from the middle"),
         ({"objects": [1]}, "objects = [1]; allowed: a table such as"),
         (
             {"objects": {"cup": [0, 0]}},
@@ -111,6 +112,33 @@ def test_other_benches_are_refused_with_what_is_allowed(bench, sentence):
     with pytest.raises(ValidationError) as refused:
         check_bench(bench)
     assert sentence in " ".join(refused.value.messages)
+
+
+@pytest.mark.parametrize(
+    ("bench", "sentence"),
+    [
+        ({"cup": [0, 0]}, "cup: unknown key; allowed: plate, block, objects"),
+        ({"block": [0, 0]}, "block = [0, 0]; allowed: 3 numbers: [x, y, yaw in degrees]"),
+        ({"plate": [0, "a"]}, "allowed: 2 numbers"),
+        ({"plate": [0, True]}, "allowed: 2 numbers"),
+        ({"plate": [0, float("nan")]}, "allowed: 2 numbers"),
+        ({"plate": 3}, "allowed: 2 numbers"),
+        ({"plate": [300, 0]}, "at most 2 from the middle"),
+        ({"factors": {"wind": 1}}, "factors.wind: unknown factor"),
+        ({"red_1": [0, 0.3, 0]}, "red_1: unknown key"),
+        ({"factors": [1]}, ""),  # what the field's own check refuses
+    ],
+)
+def test_a_layout_is_compared_with_one_simulated_bench(bench, sentence):
+    found = layout_problems(bench, load_schema("tabletop"))
+    assert sentence in " ".join(found) if sentence else found == []
+
+
+def test_another_bench_has_other_objects():
+    assert layout_problems({"red_1": [0, 0.3, 0], "blue_bin": [-0.08, 0.22]}, load_schema("sorting")) == []
+    check_bench_name("sorting")
+    with pytest.raises(ValidationError, match="allowed: sorting, tabletop, or the path"):
+        check_bench_name("moon")
 
 
 def test_a_simulated_bench_lays_what_is_its_own():
