@@ -1,4 +1,4 @@
-"""Automated blind evaluation in lockstep: trial by trial as by an operator, scored by the bench's ground truth.
+"""Automated blind evaluation: trial by trial as by an operator, scored by the bench's ground truth.
 
 The operator's session takes the station, confirms its cameras, requests trials, sets up, runs and scores, all over
 REST and the live socket; it never learns the checkpoint. Then the plan's owner closes and reveals the plan.
@@ -22,6 +22,7 @@ from evaweb.lab.single_trial import (
 )
 from evaweb.lab.stall_detection import DemoFailed, wait_until
 
+_OPEN = ("prepared", "running", "paused", "ended")  # statuses of a trial that keeps its station
 _TRIES = 3  # attempts of a trial whose set-up or run is interrupted
 Tell = Callable[[str], None]
 
@@ -43,10 +44,39 @@ class CompletedTrial:
     times: Mapping[str, float]
 
 
+def require_simulated(operator: RestClient, station: str) -> None:
+    """Raise DemoFailed if the station has a real robot: nobody would watch it."""
+    if not operator.get(f"stations/{station}")["simulated"]:
+        raise DemoFailed(
+            f"station {station} has a real robot; allowed: a simulated one, nobody watches it here"
+        )
+
+
+def trials_left(operator: RestClient, plan: str) -> int:
+    """Return how many trials of a plan are not scored yet; 0 if it has ended.
+
+    Raises:
+        DemoFailed: If the plan is not frozen yet.
+    """
+    fields = operator.get(f"plans/{plan}")
+    if fields["state"] == "draft":
+        raise DemoFailed(f"plan {plan} is a draft; allowed: a frozen one")
+    return int(fields["total"]) - int(fields["counted"]) if fields["state"] == "frozen" else 0
+
+
 def run_plan(
-    operator: RestClient, station: str, plan: str, count: int, tell: Tell, progress: Progress
+    operator: RestClient,
+    station: str,
+    plan: str,
+    count: int,
+    tell: Tell,
+    progress: Progress,
+    *,
+    lockstep: bool,
 ) -> list[CompletedTrial]:
     """Run the next `count` trials of a plan, or fewer if its design ends.
+
+    A trial that an earlier program left open at the station is scored if its run has ended, otherwise given up.
 
     Raises:
         DemoFailed: If a trial cannot be completed, or reveals its checkpoint.
@@ -54,11 +84,12 @@ def run_plan(
     trials = []
     with closing(LivePage(operator, station)) as page:
         claim_station(page)
+        _finish_open_trials(operator, page, station, plan)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
             try:
                 with progress.during(f"trial {number} of {count}"):
-                    trial = _run_trial(operator, page, station, plan)
+                    trial = _run_trial(operator, page, station, plan, lockstep)
             except DemoFailed:
                 if operator.get(f"plans/{plan}")["state"] == "frozen":
                     raise
@@ -92,15 +123,26 @@ def close_and_reveal(owner: RestClient, plan: str, made: list[CompletedTrial]) -
     }
 
 
-def _run_trial(operator: RestClient, page: LivePage, station: str, plan: str) -> CompletedTrial:
+def _finish_open_trials(operator: RestClient, page: LivePage, station: str, plan: str) -> None:
+    for status in _OPEN:
+        for trial in operator.get(f"trials?station={station}&status={status}&evaluation={plan}")["items"]:
+            if status == "ended":
+                score_by_truth(operator, trial["id"])
+            else:
+                _give_up(operator, page, trial["id"], "the program that ran it was ended")
+
+
+def _run_trial(
+    operator: RestClient, page: LivePage, station: str, plan: str, lockstep: bool
+) -> CompletedTrial:
     fault = ""
     for _ in range(_TRIES):
         handed = operator.post(f"plans/{plan}/next", {"station": station})
         code, trial = handed["code"], handed["trial"]
         _require_blind(code, trial)
         try:
-            set_up_and_run(page, trial["id"], lockstep=True)
-            run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), lockstep=True)
+            set_up_and_run(page, trial["id"], lockstep=lockstep)
+            run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), lockstep=lockstep)
             scored = score_by_truth(operator, trial["id"])
         except DemoFailed as failed:
             fault = str(failed)

@@ -17,7 +17,7 @@ from robots.capsules import capsules
 from robots.rotations import transform_of
 from robots.shapes import PLAIN
 from robots.visuals import Visual
-from runtime.benches.looks import looks_of
+from runtime.benches.appearance import describe_appearance
 from runtime.benches.schema import UnusableBench, load_schema
 
 Float64 = NDArray[np.float64]
@@ -50,7 +50,7 @@ def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, bench: st
 def _bench(name: str) -> dict[str, Any] | None:
     """Return how the bench's objects look, None if its folder is not on this machine: they are not drawn then."""
     try:
-        return looks_of(load_schema(name))
+        return describe_appearance(load_schema(name))
     except UnusableBench:
         return None
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evaweb.stations.robot_geometry import DrawnRobot
 from robots import urdf
 from robots.visuals import Visual
-from runtime.benches.looks import shade
+from runtime.benches.appearance import shade
 from runtime.benches.schema import load_schema
 
 Float64 = NDArray[np.float64]

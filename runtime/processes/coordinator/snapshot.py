@@ -6,7 +6,7 @@ import math
 from typing import Any, get_args
 
 from robots.units import units_of
-from runtime.benches.looks import looks_of
+from runtime.benches.appearance import describe_appearance
 from runtime.benches.schema import load_schema
 from runtime.core.plugins import variants
 from runtime.core.sentences import within
@@ -103,7 +103,9 @@ def station_facts(spec: StationSpec) -> dict[str, Any]:
         "preview_rate": bus.preview_rate,
         "recorded": spec.deployment.recording.enabled,
         "lease_ttl_s": spec.deployment.lease.ttl_s,
-        "bench": looks_of(load_schema(spec.capabilities.bench)) if spec.capabilities.bench else None,
+        "bench": describe_appearance(load_schema(spec.capabilities.bench))
+        if spec.capabilities.bench
+        else None,
     }
 
 

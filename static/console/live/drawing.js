@@ -2,8 +2,10 @@
 
 // Curves of the stream "recent" -> names under which they are drawn.
 const CURVES = { measured: "state", raw: "raw", planned: "smoothed", executed: "executed" };
-// Shortest time between frames [ms] in a browser without a graphics card, which shares the processor with the robot's programs.
-const SOFTWARE_FRAME_MS = 60;
+// A browser without a graphics card shares the processor with the robot's programs, and 3D is most of its work: shortest times [ms]
+// between frames, and between frames with 3D. Pictures do not wait for 3D.
+const SOFTWARE_FRAME_MS = 30;
+const SOFTWARE_SCENE_MS = 120;
 
 const nothing = { poses() {}, bench() {}, chunk() {}, aim() {}, add() {}, joints() {}, software: false };
 
@@ -20,8 +22,20 @@ export async function drawFrame(frame, store, cameras) {
   if (streams.joints) store.setJoints({ ...streams.joints.json, ...arrays(frame, streams.joints) });
   if (streams.recent) panes.curves.add(samples(frame, streams.recent));
   if (streams.chunk) panes.scene.chunk({ ...streams.chunk.json, ...arrays(frame, streams.chunk) });
-  if (streams.poses) panes.scene.poses(frame.numbers(streams.poses), streams.poses.shape.length > 2 ? streams.poses.shape[0] : 1);
+  if (streams.poses) poses = [frame.numbers(streams.poses), streams.poses.shape.length > 2 ? streams.poses.shape[0] : 1];
+  drawPoses();
   if (panes.scene.software) await pace();
+}
+
+let poses = null; // the newest that are not drawn yet
+let posesDue = 0; // earliest time at which they are drawn, on this page's clock [ms]
+
+function drawPoses() {
+  const now = performance.now();
+  if (!poses || (panes.scene.software && now < posesDue)) return;
+  panes.scene.poses(...poses);
+  poses = null;
+  posesDue = now + SOFTWARE_SCENE_MS;
 }
 
 function onScreen() {

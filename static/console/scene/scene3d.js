@@ -92,7 +92,7 @@ export class Scene3D {
 
   /**
    * Place the objects on a simulated bench: {blocks: [[x, y, z, yaw]], plate: [x, y]}, or {blocks, discs: [[x, y]]} with several
-   * discs. `looks` says how they look, as runtime.benches.looks; without it, the geometry does.
+   * discs. `looks` says how they look, as runtime.benches.appearance; without it, the geometry does.
    */
   setBench({ blocks = [], plate, discs = Array.isArray(plate) ? [plate] : [] }, looks = this.#geometry?.bench) {
     if (!looks || !this.#geometry || !discs.length) return;

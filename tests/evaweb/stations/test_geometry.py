@@ -12,7 +12,7 @@ from evaweb.core.errors import NotFound
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import drawn_robot
-from runtime.benches.looks import looks_of
+from runtime.benches.appearance import describe_appearance
 from runtime.benches.schema import load_schema
 
 
@@ -72,7 +72,9 @@ def test_pages_fetch_it_by_station_and_by_robot(client, django_user_model):
     Station.objects.create(name="bench-9", robot="agilex_piper", simulated=True)
     assert client.get("/stations/bench-9/geometry").status_code == 302
     client.force_login(django_user_model.objects.create_user("ann"))
-    assert client.get("/stations/bench-9/geometry").json()["bench"] == looks_of(load_schema("tabletop"))
+    assert client.get("/stations/bench-9/geometry").json()["bench"] == describe_appearance(
+        load_schema("tabletop")
+    )
     assert client.get("/stations/bench-9/geometry?groups=right_arm").json()["groups"] == ["right_arm"]
     assert client.get("/robots/agilex_piper/geometry").json()["bench"] is None
     for address in (

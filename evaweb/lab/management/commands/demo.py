@@ -214,7 +214,9 @@ class Command(BaseCommand):
         visitors = [RestClient(url) for _ in logins]
         for visitor, login in zip(visitors, logins, strict=True):
             visitor.login(login.username, login.password)
-        completed = plan_runner.run_plan(visitors[0], _STATION, name, count, self.stderr.write, progress)
+        completed = plan_runner.run_plan(
+            visitors[0], _STATION, name, count, self.stderr.write, progress, lockstep=True
+        )
         with progress.during("the reveal, and what came out"):
             result = plan_runner.close_and_reveal(visitors[1], name, completed)
             plan.refresh_from_db()

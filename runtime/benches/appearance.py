@@ -8,7 +8,7 @@ from typing import Any
 from runtime.benches.schema import BenchSchema
 
 
-def looks_of(schema: BenchSchema) -> dict[str, Any]:
+def describe_appearance(schema: BenchSchema) -> dict[str, Any]:
     """Return `blocks` (size, colour) and `discs` (radius, height, colour, rim) in the order of a bench's ground truth.
 
     Distractors, which are like the first block, follow the schema's blocks. Lengths in m, colours from 0 to 1.
