@@ -370,9 +370,12 @@ def _rows(policy: str) -> None:
 
 def _at_rest(operator: _Operator, robot: Path, data: Path) -> DataAtEnd:
     """Run one more trial, wait for transfers, finish open trials, reconcile, and return the contents."""
+    from django.db import connections
+
     from evaweb.stations.models import Command
     from evaweb.trials.models import Score, Trial
 
+    connections.close_all()  # PostgreSQL has been restarted since they were opened
     until, worked, before = time.monotonic() + _REST_S, False, len(operator.acts)
     while not worked and time.monotonic() < until:
         worked = operator.once() and any(act.kind == "run" for act in operator.acts[before:])

@@ -1,9 +1,9 @@
 """Time from a picture at the robot's node until it is on the screen of an open page ("glass to glass").
 
 The node draws test patterns that contain their own number, and stamps each before it draws it. The page is the Debug
-page in Debian's Chromium, with cameras, curves and 3D; without a graphics card the latter is drawn by the processor. A
-picture counts as displayed at the first animation frame after the one in which it was drawn, which is up to 17 ms after
-it was visible. The number is read from the drawn pixels, so nothing rests on what the station or the page reports.
+page in Debian's Chromium, with cameras and curves. A browser without a graphics card has no 3D, unless it is told to let
+the processor draw it (`glass_3d_ms`). A picture counts as displayed at the first animation frame after the one in which
+it was drawn, which is up to 17 ms after it was visible. The number is read from the drawn pixels, so nothing rests on what the station or the page reports.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from runtime.core import msgpack_arrays
 from runtime.simulation.bench.numbered_frames import BITS
 
 CAMERA = "cam_high"
+_BROWSERS = {"glass_ms": ["--disable-3d-apis"], "glass_3d_ms": ["--enable-unsafe-swiftshader"]}
 _MARGIN_S = 4.0
 _SHOWN_S = 60.0
 # Runs before the page's own scripts. After each drawing into the camera's canvas it reads the number from the top
@@ -75,7 +76,7 @@ class NodeListener(threading.Thread):
 
 
 def measure(seconds: float) -> Report:
-    """Measure `glass_ms` from the node's stamp to the page, and the share of the pictures that were displayed."""
+    """Measure `glass_ms` from the node's stamp to the page without 3D, and `glass_3d_ms` with it."""
     with tempfile.TemporaryDirectory() as folder:
         settings = ["control.rate=30.0", "recording.fps=30.0"]
         with (
@@ -88,18 +89,21 @@ def measure(seconds: float) -> Report:
             listener = NodeListener(lab.announced["node"])
             listener.start()
             try:
-                shown, percent = _displayed(lab, seconds)
+                displayed = {name: _displayed(lab, seconds, draws) for name, draws in _BROWSERS.items()}
             finally:
                 listener.end()
-    ages = _ages_ms(listener.stamps, shown)
-    figures = [
-        Figure("glass_ms.p50", float(np.percentile(ages, 50)), "ms", "<= 80"),
-        Figure("glass_ms.p99", float(np.percentile(ages, 99)), "ms"),
-        Figure("displayed_hz", len(ages) / seconds, "Hz"),
-        Figure("lab_cpu_percent", percent["lab"], "%"),
-        Figure("other_cpu_percent", percent["others"], "%"),
-    ]
-    return Report("glass", figures, [{"cpu_percent": percent}])
+    figures = []
+    for name, (shown, percent) in displayed.items():
+        ages = _ages_ms(listener.stamps, shown)
+        wanted = "<= 80" if name == "glass_ms" else ""
+        figures += [
+            Figure(f"{name}.p50", float(np.percentile(ages, 50)), "ms", wanted),
+            Figure(f"{name}.p99", float(np.percentile(ages, 99)), "ms"),
+            Figure(f"displayed_hz.{name}", len(ages) / seconds, "Hz"),
+            Figure(f"lab_cpu_percent.{name}", percent["lab"], "%"),
+            Figure(f"other_cpu_percent.{name}", percent["others"], "%"),
+        ]
+    return Report("glass", figures, [{name: percent for name, (_, percent) in displayed.items()}])
 
 
 def _ages_ms(stamps: Mapping[int, float], shown: Mapping[int, float]) -> np.ndarray:
@@ -113,8 +117,10 @@ def _ages_ms(stamps: Mapping[int, float], shown: Mapping[int, float]) -> np.ndar
     return np.array(ages)
 
 
-def _displayed(lab: RunningLab, seconds: float) -> tuple[dict[int, float], dict[str, float]]:
-    """Open the page for `seconds`, and record which pictures it displays.
+def _displayed(
+    lab: RunningLab, seconds: float, options: Sequence[str]
+) -> tuple[dict[int, float], dict[str, float]]:
+    """Open the page for `seconds` in a browser with these options, and record which pictures it displays.
 
     Return the time at which each picture was displayed first, by the number of the picture, and the processor load.
     """
@@ -123,7 +129,7 @@ def _displayed(lab: RunningLab, seconds: float) -> tuple[dict[int, float], dict[
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=shutil.which("chromium") or "/usr/bin/chromium",
-            args=["--no-sandbox", "--enable-unsafe-swiftshader"],
+            args=["--no-sandbox", *options],
         )
         try:
             page = browser.new_page(viewport={"width": 1440, "height": 900})
