@@ -23,6 +23,7 @@ from evaweb.lab.single_trial import (
 from evaweb.lab.stall_detection import DemoFailed, wait_until
 
 _OPEN = ("prepared", "running", "paused", "ended")  # statuses of a trial that keeps its station
+_FREE_S = 60.0  # time for the lease of a program that was killed to expire
 _TRIES = 3  # attempts of a trial whose set-up or run is interrupted
 Tell = Callable[[str], None]
 
@@ -83,6 +84,7 @@ def run_plan(
     """
     trials = []
     with closing(LivePage(operator, station)) as page:
+        page.wait(lambda state: not state["lease"]["holder"], _FREE_S, "waiting until the station is free")
         claim_station(page)
         _finish_open_trials(operator, page, station, plan)
         operator.post(f"stations/{station}/cameras", {"first": True})
