@@ -1,9 +1,10 @@
 """Time from a picture at the robot's node until it is on the screen of an open page ("glass to glass").
 
 The node draws test patterns that contain their own number, and stamps each before it draws it. The page is the Debug
-page in Debian's Chromium, with cameras and curves. A browser without a graphics card has no 3D, unless it is told to let
-the processor draw it (`glass_3d_ms`). A picture counts as displayed at the first animation frame after the one in which
-it was drawn, which is up to 17 ms after it was visible. The number is read from the drawn pixels, so nothing rests on what the station or the page reports.
+page in Debian's Chromium, with cameras and curves. A browser without a graphics card has no 3D, unless it is told to
+let the processor draw it (`glass_3d_ms`). A picture counts as displayed at the first animation frame after the one in
+which it was drawn, which is up to 17 ms after it was visible. The number is read from the drawn pixels, so nothing
+rests on what the station or the page reports.
 """
 
 from __future__ import annotations

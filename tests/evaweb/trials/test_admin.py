@@ -24,6 +24,7 @@ def scene_form(**given):
         "instruction": "put the cup in the sink",
         "active": "on",
         "layout": "",
+        "bench": "tabletop",
         "criterion": "",
         "time_limit_s": "60",
         "positions-TOTAL_FORMS": "1",
