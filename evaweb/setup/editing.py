@@ -8,6 +8,7 @@ from typing import Any
 from django.http import HttpRequest
 from django.template.loader import render_to_string
 from django.urls import reverse
+from django.utils.text import slugify
 
 from evaweb.core.errors import EvaError
 from evaweb.plans.bench_checks import cameras_of
@@ -146,6 +147,7 @@ def new(source: Scene | None, bench: str = "") -> dict[str, Any]:
         table["positions"] = [PositionTable(number=1, bench=laid).model_dump()]
     if source is None and bench:
         table["title"], table["instruction"] = schema.title, schema.instruction
+        table["name"] = slugify(schema.title)
         rows = {truth: schema.milestones[truth] for truth in schema.success}
         table["milestones"] = [
             MilestoneTable(text=row.text, required=True, truth=truth).model_dump()

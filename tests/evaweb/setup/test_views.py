@@ -88,9 +88,8 @@ def test_a_new_scene_for_another_bench_begins_with_its_task_and_is_saved(client,
     given = state(client, alma, reverse("setup-new-scene") + "?bench=sorting")
     assert set(given["bench"]["objects"]) == set(given["scene"]["positions"][0]["bench"])
     assert len(given["scene"]["milestones"]) == 5
-    whole = {**given["scene"], "name": "sorting"}
-    assert to("setup-new-scene", {"scene": whole}).status_code == 200
-    page = client.get(reverse("setup-scene", args=["sorting"]))
+    assert to("setup-new-scene", {"scene": given["scene"]}).status_code == 200
+    page = client.get(reverse("setup-scene", args=["sorting-by-colour"]))
     assert "Red block 1 rests in the blue bin" in page.content.decode()
     assert page.context["state"]["bench"]["objects"]["red_1"]["colour"] == "#e24a16"
 

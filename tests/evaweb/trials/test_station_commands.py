@@ -44,6 +44,15 @@ def test_a_real_bench_is_not_laid_out_by_command(bench, wire):
     assert "bench" not in heard(wire, "setup")[0].args
 
 
+def test_a_scene_of_another_bench_names_it_even_without_a_layout(bench, wire):
+    bench.scene.bench = "sorting"
+    bench.scene.save()
+    bench.scene.positions.update(bench=None)
+    row = give(bench, bench.prepare(seed=42), "setup")
+    laid = {"id": str(row.pk), "seed": 42, "positions": None, "of": "sorting"}
+    assert heard(wire, "setup")[0].args["bench"] == laid
+
+
 def test_every_set_up_lays_the_bench_anew(bench, wire):
     trial = bench.prepare()
     first, second = give(bench, trial, "setup"), give(bench, trial, "setup")

@@ -25,6 +25,10 @@ _RESET_ALREADY = Pattern(
     "setup: bench.id = {identity!r}: the bench was reset under this id already; allowed: an id of its "
     "own for each reset, or none",
 )
+_OTHER_BENCH = Pattern(
+    "bench.other_bench",
+    "setup: the scene is laid out for the simulated bench {wanted!r}; this station has {own!r}",
+)
 _NO_LAYOUT = Pattern("bench.no_layout", "setup: bench.positions: {why}")
 _CANNOT_RESET = Pattern("bench.cannot_reset", "the bench cannot be reset: {why}")
 _NOT_RESET = Pattern("bench.not_reset", "the bench was not reset within {seconds:g} s: {why}")
@@ -62,13 +66,16 @@ class BenchReset:
             return None
         if not self._plan.capabilities.bench:
             raise SetupError(_NOT_SIMULATED(seed=bench.seed))
-        schema = load_schema(self._plan.capabilities.bench)
+        own = self._plan.capabilities.bench
+        if bench.of is not None and bench.of != own:
+            raise SetupError(_OTHER_BENCH(wanted=bench.of, own=own))
+        schema = load_schema(own)
         problems = (*schema.problems(bench.positions or {}), *schema.factor_problems(bench.factors or {}))
         if problems:
             raise SetupError(_NO_LAYOUT(why=problems[0]))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
             raise SetupError(_RESET_ALREADY(identity=bench.id))
-        return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
+        return bench.model_dump(exclude_none=True, exclude={"of"}) | {"id": bench.id or str(uuid.uuid4())}
 
     def start(self, reset: dict[str, Any]) -> None:
         """Begin to request `reset`, the result of `from_request`; `is_done` sends and repeats the request."""

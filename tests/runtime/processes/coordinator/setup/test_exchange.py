@@ -324,6 +324,12 @@ def test_a_layout_has_to_fit_the_bench_of_the_transport(tmp_path: Path) -> None:
     )
     with pytest.raises(SetupError, match=r"bench\.positions: block: unknown object; allowed: blue_bin"):
         station.command("setup", bench=BENCH)
+    with pytest.raises(
+        SetupError, match="laid out for the simulated bench 'tabletop'; this station has 'sorting'"
+    ):
+        station.command("setup", bench={"seed": 2, "of": "tabletop"})
+    station.prepare(bench={"seed": 3, "of": "sorting"})
+    assert "of" not in station.robot.told[-1][1]  # it is not the node's
     station.close()
 
 
