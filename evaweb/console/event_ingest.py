@@ -92,7 +92,7 @@ class StationEventIngester:
 
         A station without a row is skipped.
         """
-        sweep = time.monotonic() - self._swept > _SWEEP_S
+        sweep = self._feed.link.ok and time.monotonic() - self._swept > _SWEEP_S
         state, history = self._feed.state, self._feed.history
         lease = self._lease_of(state)
         behind = bool(history.boot) and self._written != (history.boot, history.newest)
@@ -110,7 +110,7 @@ class StationEventIngester:
             self._lease = lease
         if behind:
             self._written = ingest_events(station=station, history=history, state=str(state.get("state", "")))
-        if sweep and self._feed.link.ok:
+        if sweep:
             for row in commands.unresolved_commands(station=station):
                 commands.resolve_unknown_outcome(row=row)
             refresh_preflights(station=station)

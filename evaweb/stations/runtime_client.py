@@ -130,10 +130,9 @@ class StationConnection:
 
     def address(self, process: str, key: str) -> str:
         """Return the address of a socket, as its process last wrote it. Raises: StationGone if there is none."""
-        try:
-            return str(self.endpoints.read(process)[key])
-        except (TransportError, KeyError):
-            raise self._not_running() from None
+        if address := self.endpoints.address(process, key):
+            return address
+        raise self._not_running()
 
     def _not_running(self) -> StationGone:
         return StationGone(self._link() or _NOT_RUNNING(name=self.name))
@@ -141,11 +140,10 @@ class StationConnection:
     def _link(self) -> str:
         """Return the gate's report on the link to a station on another computer, "" if there is none."""
         try:
-            fields = self.endpoints.read("link")
-            since = localtime(datetime.fromtimestamp(float(fields["since"]), UTC))
-            return _LINK(name=self.name, since=f"{since:%H:%M:%S}", why=str(fields["why"]))
-        except (TransportError, KeyError, ValueError, OverflowError, OSError):
+            since = localtime(datetime.fromtimestamp(float(self.endpoints.address("link", "since")), UTC))
+        except (ValueError, OverflowError, OSError):
             return ""
+        return _LINK(name=self.name, since=f"{since:%H:%M:%S}", why=self.endpoints.address("link", "why"))
 
     def _connected(self) -> CommandClient:
         endpoint = self.address("coordinator", "commands")

@@ -148,11 +148,8 @@ class Relay:
 
     def _send(self, question: _PendingQuestion) -> None:
         """Send the request to the current endpoint of its socket, unless it was sent there already."""
-        try:
-            endpoint = str(self._endpoints.read(question.process)[question.socket])
-        except (TransportError, KeyError):
-            return
-        if endpoint == question.endpoint:
+        endpoint = self._endpoints.address(question.process, question.socket)
+        if not endpoint or endpoint == question.endpoint:
             return
         if question.client is not None:
             self._taken(question).close()

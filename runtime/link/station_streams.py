@@ -12,7 +12,6 @@ from typing import Any
 
 import zmq
 
-from runtime.core.errors import TransportError
 from runtime.ipc.bus import Endpoints
 from runtime.link.wire import COORDINATOR, MEDIA, MOST_PARTS, STATE, Bundle, Credit
 
@@ -32,10 +31,7 @@ class Source:
 
     def endpoint(self) -> str:
         """Return the current endpoint; "" if there is none."""
-        try:
-            return str(self.endpoints.read(self.process)[self.socket])
-        except (TransportError, KeyError):
-            return ""
+        return self.endpoints.address(self.process, self.socket)
 
 
 def source_of(station_dir: Path, role: str) -> Source:

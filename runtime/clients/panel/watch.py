@@ -13,7 +13,7 @@ from typing import Any
 
 import zmq
 
-from runtime.core.errors import CodecError, TransportError
+from runtime.core.errors import CodecError
 from runtime.ipc.bus import Endpoints, Subscriber
 from runtime.ipc.session_state import complete_state_meaning
 from runtime.link.uplink import read_uplink
@@ -133,10 +133,7 @@ class Watch:
             self._state, self._pictures = {}, {}  # old images are never shown as new
 
     def _place(self, process: str, socket: str) -> str:
-        try:
-            return str(self._endpoints.read(process)[socket])
-        except (TransportError, KeyError):
-            return ""
+        return self._endpoints.address(process, socket)
 
 
 class _Ear:

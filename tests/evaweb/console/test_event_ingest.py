@@ -108,6 +108,13 @@ def test_events_that_are_no_longer_kept_are_said_to_be_lost(station, services, c
     assert [number for _, number, _ in services.trials] == [9]
 
 
+def test_a_station_that_is_absent_costs_no_query(station, django_assert_num_queries):
+    absent = StationEventIngester(station.name, Feeds())
+    with django_assert_num_queries(0):
+        absent._write()
+        absent._write()
+
+
 # --- threads --------------------------------------------------------------------------------------------------
 
 

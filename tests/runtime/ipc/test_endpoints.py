@@ -152,6 +152,7 @@ def test_a_file_that_holds_something_else_is_missed(
     (tmp_path / "endpoints" / "guard.json").write_bytes(spoiled)
     now = 2.0
     assert endpoints.is_missing("guard")
+    assert endpoints.address("guard", "estop") == ""
     if spoiled != b"{}":
         with pytest.raises(TransportError, match="is not running here"):
             endpoints.read("guard")
@@ -159,6 +160,7 @@ def test_a_file_that_holds_something_else_is_missed(
     successor.write("guard", {"estop": "ipc://y"})
     now = 4.0
     assert not endpoints.is_missing("guard"), "what another process says of itself stays"
+    assert endpoints.address("guard", "estop") == "ipc://y"
 
 
 # --- what happens to the folder while a station runs -------------------------------------------------------
