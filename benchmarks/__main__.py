@@ -15,6 +15,7 @@ _BENCHMARKS = (
     "coverage",
     "designs",
     "estop",
+    "farm",
     "glass",
     "ik",
     "lab",

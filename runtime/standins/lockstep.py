@@ -40,7 +40,7 @@ from runtime.station.spec import StationSpec
 
 REST_S = 1.0  # duration of success after which a run ends
 # Deadlines count real seconds; a server in this process must not be declared lost because the machine is busy.
-_PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
+PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
 class SuccessDetector:
@@ -82,6 +82,12 @@ def in_process_peers(
     )
 
 
+def bench_of(spec: StationSpec) -> str:
+    """Return the bench that a deployment's transport declares; the tabletop with contact forces, "none" without any."""
+    declared = spec.capabilities.bench
+    return "contact" if declared == "tabletop" else declared or "none"
+
+
 def station(
     path: Path, assignments: Sequence[str], clock: VirtualClock, *bench_options: str, paced: bool = False
 ) -> ServedLockstep:
@@ -93,8 +99,7 @@ def station(
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
     spec = check_deployment(loader.load(path, assignments))
-    bench = "contact" if spec.capabilities.bench == "tabletop" else spec.capabilities.bench or "none"
-    arguments = ("--robot", spec.robot.name, "--bench", bench, *bench_options)  # the last --bench counts
+    arguments = ("--robot", spec.robot.name, "--bench", bench_of(spec), *bench_options)  # the last --bench counts
     options = node_parser().parse_args(arguments)
     around = environments.make_environment(spec.robot, options)
     peers = in_process_peers(spec, clock, around, options)
@@ -146,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 server_options = serve.parser().parse_args(shlex.split(line))
                 server = stack.enter_context(closing(serve.build_server(server_options, clock)))
                 urls[str(server_options.name or len(urls))] = str(server.start()["url"])
-            own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
+            own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (PATIENT if urls else [])
             bench = (*(("--bench", options.bench) if options.bench else ()), "--seed", options.seed)
             size = ("--width", options.width, "--height", options.height)
             served = station(

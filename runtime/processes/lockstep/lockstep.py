@@ -37,6 +37,8 @@ from runtime.transports.base import Sink, Source
 
 _HOLDER = "lockstep"
 _ROUNDING = 1e-6  # [ticks] that a delay of whole ticks may lie above them
+Over = Callable[[bool], str]
+"""Called before each tick with whether a run is active; returns why the run is over, or ""."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ class LockstepEnvironment:
     preview: Callable[[Observation], None] = lambda observation: None
     closer: Callable[[Close], Future[ClosedEpisode]] = at_once
     on_disk: Callable[[Path], None] = lambda folder: None
+    over: Over = lambda running: ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,7 @@ class Lockstep:
         recorder = make_recorder(spec, clock.now, patient=True)
         self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
+        self._over = around.over
         self._runner = around.runner or LockstepRunner(self.delayed)
         self.coordinator = assemble(spec, self.shared, clock, self._runner, around.client_clock, peers.policy)
         self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
@@ -106,7 +110,9 @@ class Lockstep:
         self._sink.connect()
 
     def tick(self) -> None:
-        """Run one control period."""
+        """Run one control period; if the source's run is over, the station's run ends within this period."""
+        if reason := self._over(self.coordinator.session.state is SessionState.RUNNING):
+            self.coordinator.end_source_run(reason)
         now = self.clock.now()
         for process in ("control", "guard", "reception", "media"):
             self.shared.beat(process, now)
@@ -202,21 +208,37 @@ def check(spec: StationSpec) -> None:
         )
 
 
-def run(spec: StationSpec, longest: float = 3600.0, peers: Peers | None = None) -> LockstepRun:
-    """Set up, run until the source's end or for run.duration_s, and close. Raises RuntimeFault.
+def run(
+    spec: StationSpec,
+    longest: float = 3600.0,
+    peers: Peers | None = None,
+    clock: VirtualClock | None = None,
+    over: Over = lambda running: "",
+    orders: Mapping[str, Mapping[str, Any]] | None = None,
+) -> LockstepRun:
+    """Set up, run until the source's end or for run.duration_s, and close.
 
-    `longest` bounds the virtual time of the run [s]; `peers` as in `Lockstep`.
+    Args:
+        spec: The station.
+        longest: Bound of the run's virtual time [s].
+        peers: As in `Lockstep`; they share `clock`.
+        clock: Virtual clock of the station.
+        over: Called before each tick; it ends the run by returning why.
+        orders: Arguments of the commands "setup" and "run".
+
+    Raises:
+        RuntimeFault: If the station cannot be set up, or the run does not end.
     """
-    station = Lockstep(spec, peers=peers)
-    session = station.coordinator.session
+    station = Lockstep(spec, clock, LockstepEnvironment(over=over), peers)
+    session, orders = station.coordinator.session, orders or {}
     try:
         station.connect()
         station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
-        station.command("setup")
+        station.command("setup", **orders.get("setup", {}))
         prepared = station.until(lambda: session.state is not SessionState.SETTING_UP, 120.0, "set-up")
         if prepared is not SessionState.READY:
             raise SetupError(f"set-up failed: {session.reason}")
-        station.command("run")
+        station.command("run", **orders.get("run", {}))
         how = station.until(lambda: session.state is not SessionState.RUNNING, longest, "run")
         reason = session.reason
         if how is SessionState.HOLDING:

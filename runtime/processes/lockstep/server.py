@@ -23,7 +23,7 @@ from runtime.processes.control.process import Lateness
 from runtime.processes.coordinator.inference.runners import DeclaredRunner
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import EStopServer
-from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment, Peers
+from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment, Over, Peers
 from runtime.processes.media.crash_repair import start_repair
 from runtime.processes.media.export_jobs import ExportQueue
 from runtime.processes.media.previews import Previews
@@ -36,8 +36,6 @@ _AGAIN_S = 0.2  # period for showing the same pictures again [s]
 _LAST_S, _EXPORT_S = 8.0, 3.0  # time at the end for the last episode and for exports [s]
 _FIGURES_EVERY = 30  # [ticks]
 _ON_DEMAND = ("step", "preview", "manual")  # modes that wait for a person, in real time
-Over = Callable[[bool], str]
-"""Called before each tick with whether a run is active; returns why the run is over, or ""."""
 
 
 class _TickingClock(Clock):
@@ -75,7 +73,6 @@ class ServedLockstep(Lockstep):
         if settings.control_channel.enabled:
             raise SetupError("control_channel.enabled = true in lockstep, which has none; allowed: false")
         self._people = people or MonotonicClock()
-        self._over = over
         descriptors.raise_file_limit()
         self._lock = acquire_station_lock(settings)
         Endpoints(settings.station_dir).prepare()
@@ -91,6 +88,7 @@ class ServedLockstep(Lockstep):
             preview=self._previews,
             closer=in_background,
             on_disk=self._exports.submit,
+            over=over,
         )
         super().__init__(spec, clock, around, peers)
         self._figures = Lateness(self._tick.status, LOCKSTEP)
@@ -123,10 +121,8 @@ class ServedLockstep(Lockstep):
         self._estops.serve(0.0)
 
     def tick(self) -> None:
-        """Run one control period; if the source's run is over, the station's run ends within this period."""
+        """Run one control period."""
         super()._advance_clock()
-        if reason := self._over(self.coordinator.session.state is SessionState.RUNNING):
-            self.coordinator.end_source_run(reason)
         super().tick()
         self._figures.add(0.0, 0)
         if self.step % _FIGURES_EVERY == 0:
