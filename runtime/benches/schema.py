@@ -100,7 +100,9 @@ class Distractors(Settings):
     distance: Length = 0.1
 
 
-FactorName = Literal["light", "friction", "mass", "camera_x", "camera_y", "camera_z", "distractors"]
+FactorName = Literal[
+    "light", "friction", "mass", "size", "hue", "camera_x", "camera_y", "camera_z", "distractors"
+]
 
 
 class Factor(Settings):
@@ -142,7 +144,9 @@ class BenchSchema(Settings):
     distractors: Distractors = Distractors()
     factors: dict[FactorName, Factor] = Field(default_factory=dict)
     """light: brightness of the pictures, 1 as usual. friction, mass: times those of all surfaces, and of the blocks.
-    camera_x, camera_y, camera_z: by how much the overhead camera is moved [m]. distractors: how many."""
+    size: times the edges of the blocks, whose density stays. hue: by how much the boxes' colours are turned on the
+    colour wheel [degrees]. camera_x, camera_y, camera_z: by how much the overhead camera is moved [m]. distractors: how
+    many."""
     together: list[Annotated[list[Name], Field(min_length=2)]] = Field(default_factory=list)
     """Objects that are placed so that one arm reaches all of them."""
     milestones: Annotated[dict[Name, Milestone], Field(min_length=1)]
@@ -162,6 +166,8 @@ class BenchSchema(Settings):
                     f"objects.{name}: layouts have this key for something else; allowed: another"
                 )
         for name, factor in self.factors.items():
+            if name == "size" and factor.low <= 0.0:
+                raise SetupError(f"factors.size.low = {factor.low:g}; allowed: more than 0")
             if not factor.low <= factor.usual <= factor.high:
                 raise SetupError(
                     f"factors.{name}.usual = {factor.usual:g}; allowed: {factor.low:g} to {factor.high:g}"

@@ -102,7 +102,7 @@ class BenchEnvironment(Environment):
         They are drawn only if something has moved, because drawing is most of the work.
         """
         state = self._tabletop.state()
-        view = (state.light, *state.camera_shift)
+        view = (state.light, *state.camera_shift, state.size, state.hue)
         poses = (block.pose.ravel() for block in state.blocks)
         moment = np.concatenate([q, view, *state.discs, *poses]).tobytes()
         if moment != self._drawn[0]:

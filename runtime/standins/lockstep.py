@@ -99,7 +99,13 @@ def station(
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
     spec = check_deployment(loader.load(path, assignments))
-    arguments = ("--robot", spec.robot.name, "--bench", bench_of(spec), *bench_options)  # the last --bench counts
+    arguments = (
+        "--robot",
+        spec.robot.name,
+        "--bench",
+        bench_of(spec),
+        *bench_options,
+    )  # the last --bench counts
     options = node_parser().parse_args(arguments)
     around = environments.make_environment(spec.robot, options)
     peers = in_process_peers(spec, clock, around, options)

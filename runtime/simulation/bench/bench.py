@@ -6,6 +6,8 @@ table, where y is less than in the area for objects.
 
 from __future__ import annotations
 
+import colorsys
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -91,6 +93,13 @@ class Bench:
         """Edge of the first block, and of distractors [m]."""
         return self._edges[0]
 
+    def varied(self, size: float, hue: float) -> Bench:
+        """Return the bench with all edges of blocks times `size`, and the boxes' colours turned by `hue` [degrees]."""
+        other = copy.copy(self)
+        other._edges = tuple(round(edge * size, 6) for edge in self._edges)
+        other._colours = tuple(_turn(colour, hue) for colour in self._colours)
+        return other
+
     def edge(self, block: int) -> float:
         """Return the edge of the block of that number [m]."""
         return self._edges[block] if block < len(self._edges) else self._edges[0]
@@ -101,6 +110,16 @@ class Bench:
             return self._colours[block]
         palette = (self._colours[0], *self._distractor_colours)
         return palette[block % len(palette)]
+
+
+def _turn(colour: Colour, hue: float) -> Colour:
+    """Return a colour turned by `hue` [degrees] on the colour wheel."""
+    if not hue:
+        return colour
+    at, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in colour))
+    return _colour(
+        [round(255 * part) for part in colorsys.hsv_to_rgb((at + hue / 360) % 1.0, saturation, value)]
+    )
 
 
 def _edge(name: str, box: Box) -> float:
@@ -142,6 +161,10 @@ class BenchState:
     """Brightness of the pictures."""
     camera_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """By how much the overhead camera is moved [m]."""
+    size: float = 1.0
+    """Edges of the blocks, as a multiple of the usual ones."""
+    hue: float = 0.0
+    """By how much the boxes' colours are turned on the colour wheel [degrees]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,7 @@ from runtime.simulation.bench.plant import Plant
 REST_S = 0.2  # time without motion after which a block is at rest
 LIFTED_M = 0.03  # height above the table from which a held block counts as lifted
 MARGIN_M = 0.01  # least distance of a block's centre inside a disc's rim for success
+_USUAL = (1.0, 0.0)  # size and hue of blocks that look as the schema says
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +69,24 @@ class BlockTable(ABC):
         """Return the state of everything on the table, for rendering."""
         discs = tuple((float(x), float(y)) for x, y in self._discs)
         x, y, z = (self._factors.get(f"camera_{axis}", 0.0) for axis in "xyz")
-        light = self._factors.get("light", 1.0)
-        return BenchState(tuple(block.state() for block in self._blocks), discs, light, (x, y, z))
+        blocks = tuple(block.state() for block in self._blocks)
+        return BenchState(blocks, discs, self._factors.get("light", 1.0), (x, y, z), *self._appearance)
+
+    @property
+    def _appearance(self) -> tuple[float, float]:
+        """Size of the blocks, as a multiple of the usual one, and turn of their hue [degrees]."""
+        return self._factors.get("size", 1.0), self._factors.get("hue", 0.0)
+
+    @property
+    def _varied(self) -> Bench:
+        """The bench with its present sizes and colours."""
+        return self.bench.varied(*self._appearance)
 
     def truth(self) -> dict[str, object]:
         """Return the ground truth for the node's observation.
 
-        Milestones that pass are those that were reached since the last reset. `plate` is the first disc.
+        Milestones that pass are those that were reached since the last reset. `plate` is the first disc. Where blocks
+        do not look as usual, `edges` [m] and `colours` (0 to 255) say how.
         """
         schema = self.bench.schema
         reached = {
@@ -89,9 +101,17 @@ class BlockTable(ABC):
             "plate": discs[0],
             **({"discs": discs} if len(discs) > 1 else {}),
             **({"factors": dict(self._reset.factors)} if self._reset.factors else {}),
+            **(self._varied_appearance() if self._appearance != _USUAL else {}),
             "held": [block.held_by for block in self._blocks],
             "milestones": reached,
             "success": all(self._rests(schema.milestones[name], MARGIN_M) for name in schema.success),
+        }
+
+    def _varied_appearance(self) -> dict[str, object]:
+        varied, numbers = self._varied, range(len(self._blocks))
+        return {
+            "edges": [varied.edge(number) for number in numbers],
+            "colours": [list(varied.colour(number)) for number in numbers],
         }
 
     def _layout(self, wish: ResetRequest) -> BenchLayout:
@@ -110,7 +130,8 @@ class BlockTable(ABC):
         except BenchError:
             self._factors = before
             raise
-        edges = [self.bench.edge(index) for index in range(len(layout.blocks))]
+        varied = self._varied
+        edges = [varied.edge(index) for index in range(len(layout.blocks))]
         self._blocks = [
             Block(block_pose(place, edge), edge) for place, edge in zip(layout.blocks, edges, strict=True)
         ]

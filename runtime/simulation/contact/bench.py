@@ -58,11 +58,19 @@ class ContactTabletop(BlockTable):
     ) -> None:
         self._mujoco = import_mujoco()
         bench = bench or Bench()
-        self._build = partial(build_model, robot, bench, physics=physics or Physics())
-        self._load(self._build(blocks=len(bench.block_names) + blocks - 1))
+        self._build = partial(build_model, robot, physics=physics or Physics())
+        self._edges: list[float] = []
+        self._rebuild(bench, len(bench.block_names) + blocks - 1)
         self._measured = np.full(robot.dim, np.nan)  # joints that the plant had after the last step
         self._reference = self._measured
         super().__init__(seed, blocks, bench)
+
+    def _rebuild(self, bench: Bench, blocks: int) -> None:
+        """Build the model anew unless it has these blocks already."""
+        edges = [bench.edge(index) for index in range(blocks)]
+        if edges != self._edges:
+            self._edges = edges
+            self._load(self._build(bench=bench, blocks=blocks))
 
     def _load(self, built: ContactModel) -> None:
         self._built, self._joints, self._model = built, built.joints, built.model
@@ -93,8 +101,7 @@ class ContactTabletop(BlockTable):
     def _place_objects(self, wish: ResetRequest) -> None:
         super()._place_objects(wish)
         values = self._data.qpos[self._joints.positions].copy()
-        if len(self._blocks) != len(self._built.blocks):
-            self._load(self._build(blocks=len(self._blocks)))
+        self._rebuild(self._varied, len(self._blocks))
         self._set_factors()
         self._put_everything(values)
 

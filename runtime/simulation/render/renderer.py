@@ -36,7 +36,9 @@ class Renderer:
         self._table = Table(bench, seed)
         self._plates = [Plate(disc) for disc in bench.discs]
         self._shadows = Shadows(bench)
-        self._solids: dict[int, Solids] = {}  # by number of blocks
+        self._solids: tuple[tuple[int, float, float], Solids] | None = (
+            None  # number, size and hue of the last blocks
+        )
         q = robot.poses["home"]
         carriers = {camera.key: benches.camera_arm(robot, camera) for camera in robot.cameras}
         still = {key for key, arm in carriers.items() if arm is None}
@@ -46,7 +48,7 @@ class Renderer:
 
     def draw(self, q: Float64, state: BenchState) -> dict[str, UInt8]:
         """Return a newly allocated BGR uint8 [H, W, 3] image per camera key, for joints [D] and a bench state."""
-        solids = self._solids_of(len(state.blocks))
+        solids = self._solids_of(len(state.blocks), state.size, state.hue)
         frames = np.array([*self._scene.poses(q), *(block.pose for block in state.blocks)])
         whole = solids.placed(frames)
         placed = solids.above_table(whole)
@@ -72,21 +74,26 @@ class Renderer:
     ) -> dict[str, PinholeCamera]:
         return benches.cameras(self._robot, q, *self._size, shift)
 
-    def _solids_of(self, blocks: int) -> Solids:
-        """Return the solids for the robot's visual shapes and for `blocks` blocks.
+    def _solids_of(self, blocks: int, size: float, hue: float) -> Solids:
+        """Return the solids for the robot's visual shapes and for `blocks` blocks of that size and hue.
 
         The frames of blocks follow the frames of the robot's parts.
         """
-        if blocks not in self._solids:
+        appearance = (blocks, size, hue)
+        if self._solids is None or self._solids[0] != appearance:
             shapes = [
                 Solid(visual.part, visual.kind, visual.size, visual.origin, visual.colour[:3])
                 for visual in (scene_visual.simple() for scene_visual in self._scene.visuals)
             ]
-            self._solids[blocks] = Solids([*shapes, *(self._block(index) for index in range(blocks))])
-        return self._solids[blocks]
+            bench = self._bench.varied(size, hue)
+            self._solids = (
+                appearance,
+                Solids([*shapes, *(self._block(bench, index) for index in range(blocks))]),
+            )
+        return self._solids[1]
 
-    def _block(self, index: int) -> Solid:
-        red, green, blue = (part / 255 for part in self._bench.colour(index))
-        edge = self._bench.edge(index)
+    def _block(self, bench: Bench, index: int) -> Solid:
+        red, green, blue = (part / 255 for part in bench.colour(index))
+        edge = bench.edge(index)
         frame = len(self._scene.parts) + index
         return Solid(frame, "box", (edge, edge, edge), np.eye(4), (red, green, blue), painted=True)

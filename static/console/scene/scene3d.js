@@ -32,6 +32,7 @@ export class Scene3D {
   #blocks = [];
   #discs = [];
   #looks = null; // of the objects that are drawn
+  #varied = ""; // and how a factor has changed them
   #lies = "";
   #geometry = null;
   #shown = { ghost: false, frames: false, path: true, chunk: true, capsules: false };
@@ -92,13 +93,19 @@ export class Scene3D {
 
   /**
    * Place the objects on a simulated bench: {blocks: [[x, y, z, yaw]], plate: [x, y]}, or {blocks, discs: [[x, y]]} with several
-   * discs. `looks` says how they look, as runtime.benches.appearance; without it, the geometry does.
+   * discs. `looks` says how they look, as runtime.benches.appearance; without it, the geometry does. `edges` [m] and
+   * `colours` (0 to 255) say it of each block where a factor of the trial has changed them.
    */
-  setBench({ blocks = [], plate, discs = Array.isArray(plate) ? [plate] : [] }, looks = this.#geometry?.bench) {
+  setBench(
+    { blocks = [], plate, discs = Array.isArray(plate) ? [plate] : [], edges, colours },
+    looks = this.#geometry?.bench,
+  ) {
     if (!looks || !this.#geometry || !discs.length) return;
-    if (looks !== this.#looks) {
+    const varied = JSON.stringify([edges, colours]);
+    if (looks !== this.#looks || varied !== this.#varied) {
       this.#clearBench();
       this.#looks = looks;
+      this.#varied = varied;
     }
     const lies = JSON.stringify([blocks, discs]);
     if (lies === this.#lies) return; // already drawn like this
@@ -112,11 +119,18 @@ export class Scene3D {
       this.#viewer.delete_path(["bench", `block${this.#blocks.length}`]);
     }
     blocks.forEach(([x, y, z, yaw], index) => {
-      this.#blocks[index] ??= this.#add(`bench/block${index}`, block(looks.blocks[index % looks.blocks.length]));
+      this.#blocks[index] ??= this.#add(`bench/block${index}`, block(this.#appearanceOf(looks, edges, colours, index)));
       this.#blocks[index].position.set(x, y, z);
       this.#blocks[index].rotation.set(0, 0, yaw);
     });
     this.#viewer.set_dirty();
+  }
+
+  #appearanceOf(looks, edges, colours, index) {
+    const usual = looks.blocks[index % looks.blocks.length];
+    if (!edges || !colours) return usual;
+    const edge = edges[index];
+    return { size: [edge, edge, edge], colour: [...colours[index].map((part) => part / 255), 1] };
   }
 
   /** Draw a chunk's rows {state, targets, overlap, tips} as dots; null draws none. */

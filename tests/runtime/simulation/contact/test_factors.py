@@ -59,6 +59,31 @@ def test_masses_and_friction_are_multiplied_and_come_back(table: ContactTabletop
     np.testing.assert_allclose(model.geom_friction[:, 0], friction)
 
 
+def test_size_and_hue_change_body_and_picture_of_the_block_and_come_back(table: ContactTabletop) -> None:
+    renderer = Renderer(ROBOT, Bench(), 160, 120)
+
+    def seen(identity: str, **factors: float) -> tuple[float, float, Any]:
+        state = lay(table, identity, **factors).state()
+        geom, *_ = table._built.block_geoms
+        mass = table._model.body_mass[table._model.geom_bodyid[geom]]
+        return 2 * table._model.geom_size[geom, 0], mass, renderer.draw(HOME, state)["cam_high"]
+
+    edge, mass, usual = seen("s1")
+    larger = seen("s2", size=1.4)
+    assert larger[0] == pytest.approx(1.4 * edge)
+    assert larger[1] == pytest.approx(1.4**3 * mass)
+    assert table.truth()["edges"] == [pytest.approx(1.4 * edge)]
+    assert table._blocks[0].bottom == pytest.approx(0.0, abs=1e-6)
+    green = seen("s3", hue=120, distractors=1)
+    assert table.truth()["colours"] == [[22, 226, 74], [40, 150, 70]]
+    for _, _, picture in (larger, green):
+        assert np.abs(picture.astype(int) - usual).max() > 50
+    back = seen("s4")
+    assert back[:2] == (edge, mass)
+    assert (back[2] == usual).all()
+    assert not {"edges", "colours"} & table.truth().keys()
+
+
 def test_distractors_come_and_go(table: ContactTabletop) -> None:
     joints = lay(table, "i")._data.qpos[table._joints.positions].copy()
     assert len(lay(table, "j", distractors=3).state().blocks) == 4
@@ -73,7 +98,7 @@ def test_distractors_come_and_go(table: ContactTabletop) -> None:
         ({"light": "dim"}, "factors.light = 'dim'"),
         ({"light": float("nan")}, "factors.light = nan"),
         ({"distractors": 1.5}, "factors.distractors = 1.5; allowed: a whole number from 0 to 4"),
-        ({"colour": 1.0}, "factors.colour: unknown factor; allowed: light, friction, mass"),
+        ({"colour": 1.0}, "factors.colour: unknown factor; allowed: light, friction, mass, size, hue"),
     ],
 )
 def test_what_the_bench_does_not_have_is_refused_and_changes_nothing(
