@@ -9,6 +9,7 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from http.client import InvalidURL
 from http.cookiejar import CookieJar
 from typing import Any
 from urllib.error import HTTPError, URLError
@@ -65,7 +66,8 @@ class RestClient:
         Raises:
             DemoFailed: If name or password is wrong.
         """
-        page = self._open(Request(f"{self.url}/login/")).decode()
+        self.username = username
+        page = self._open(self._request("login/")).decode()
         match = _TOKEN.search(page)
         if not match:
             raise DemoFailed(f"{self.url}/login/ has no login form")
@@ -82,7 +84,7 @@ class RestClient:
 
     def get(self, path: str) -> Any:
         """Return the JSON of `path` under /api/v1."""
-        return json.loads(self._open(Request(f"{self.url}/api/v1/{path}")))
+        return json.loads(self._open(self._request(f"api/v1/{path}")))
 
     def post(self, path: str, content: Mapping[str, Any]) -> Any:
         """Send JSON to `path` under /api/v1, and return the answer.
@@ -95,8 +97,7 @@ class RestClient:
             "X-CSRFToken": self.csrf_token,
             "Referer": self.url,
         }
-        request = Request(f"{self.url}/api/v1/{path}", json.dumps(content).encode(), headers)
-        return json.loads(self._open(request))
+        return json.loads(self._open(self._request(f"api/v1/{path}", json.dumps(content).encode(), headers)))
 
     @property
     def csrf_token(self) -> str:
@@ -115,6 +116,14 @@ class RestClient:
         """Header `Cookie`, as a browser sends it."""
         return "; ".join(f"{cookie.name}={cookie.value}" for cookie in self._cookies)
 
+    def _request(
+        self, path: str, data: bytes | None = None, headers: Mapping[str, str] | None = None
+    ) -> Request:
+        try:
+            return Request(f"{self.url}/{path}", data, dict(headers or {}))
+        except ValueError:
+            raise DemoFailed(f"{self.url!r:.200} is no address of a lab; allowed: http://HOST:PORT") from None
+
     def _open(self, request: Request) -> bytes:
         try:
             with self._opener.open(request, timeout=_TIMEOUT_S) as answer:
@@ -124,6 +133,10 @@ class RestClient:
                 body = refusal.read().decode("utf-8", "replace")
             raise DemoFailed(
                 f"{request.get_method()} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
+            ) from None
+        except (InvalidURL, UnicodeError):
+            raise DemoFailed(
+                f"{request.full_url!r:.200} is no address; allowed: http://HOST:PORT, and names of plans and stations"
             ) from None
         except (
             URLError,

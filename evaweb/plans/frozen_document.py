@@ -49,6 +49,7 @@ _CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
 # scenes as they were at the time; reveals of 5 stored neither caveats nor the digest of the record, those of 6 nothing
 # for a plan without a comparison.
 FORMAT = 7
+_LEFT_OUT = ("bench", "bench_digest")  # keys of a scene that the default bench does not have
 _DRAWN_BY_ITSELF = 6  # format from which the order within each block is drawn independently
 
 
@@ -127,7 +128,9 @@ def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
         "criterion": scene.criterion,
         "layout": scene.layout,
         # The default is left out: digests of plans frozen before there were several benches stay the same.
-        **({"bench": scene.bench} if scene.bench != DEFAULT_BENCH else {}),
+        **(
+            {"bench": scene.bench, "bench_digest": scene.bench_digest} if scene.bench != DEFAULT_BENCH else {}
+        ),
         "time_limit_s": scene.time_limit_s,
         "ordered": scene.ordered,
         "positions": [
@@ -181,8 +184,9 @@ def require_scene(plan: Plan, scene: Scene) -> None:
 
 
 def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
-    """Yield each changed value as text."""
-    for key, value in frozen.items():
+    """Yield each changed value as text; a key that only one of the two has is a change."""
+    for key in (*frozen, *(key for key in _LEFT_OUT if key in now and key not in frozen)):
+        value = frozen.get(key)
         if not isinstance(value, list):
             if value != now.get(key):
                 yield f"{key} was {value!r}, is {now.get(key)!r}"

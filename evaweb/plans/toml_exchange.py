@@ -119,6 +119,7 @@ def _written(
 def _scene_table(scene: Scene) -> dict[str, Any]:
     table = scene_of(scene, list(scene.positions.order_by("number")))
     table["bench"] = scene.bench
+    table.pop("bench_digest", None)
     table["failure_required"] = scene.failure_required  # a rule for raters, not part of a frozen plan
     table["position"], table["milestone"] = table.pop("positions"), table.pop("milestones")
     return table

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -14,7 +13,7 @@ import pydantic
 from django.core.exceptions import ValidationError
 
 from evaweb.trials.failure_text import is_unspecified
-from runtime.benches.schema import DEFAULT_BENCH, BenchSchema, UnusableBench, load_schema
+from runtime.benches.schema import DEFAULT_BENCH, BenchSchema, UnusableBench, is_place, load_schema
 from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
@@ -152,7 +151,7 @@ def _numbers_problem(key: str, value: object, parts: Sequence[str]) -> str:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return is_place([value], 1)
 
 
 def _problems(value: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:

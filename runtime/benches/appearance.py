@@ -15,7 +15,8 @@ def describe_appearance(schema: BenchSchema) -> dict[str, Any]:
     """
     boxes = list(schema.boxes.values())
     blocks = [(box.size, box.colour) for box in boxes]
-    blocks += [(boxes[0].size, colour) for colour in schema.distractors.colours] if boxes else []
+    most = schema.factors["distractors"].high if "distractors" in schema.factors else 0
+    blocks += [(boxes[0].size, schema.distractor_colour(number)) for number in range(round(most))]
     return {
         "blocks": [{"size": size, "colour": shade(colour)} for size, colour in blocks],
         "discs": [

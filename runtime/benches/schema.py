@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import math
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -25,6 +27,19 @@ Colour = Annotated[list[Part], Field(min_length=3, max_length=3)]
 Length = Annotated[float, Field(gt=0, le=2)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 _NUMBERS = ("x", "y", "yaw in degrees")
+_FARTHEST = 2.0  # [m] of an edge of the area from the middle
+_LARGEST = 1e6  # absolute value of a number of a layout
+_RANGES = {  # least and greatest value that a factor may be declared to have
+    "light": (0.05, 5.0),
+    "friction": (0.01, 10.0),
+    "mass": (0.05, 100.0),
+    "size": (0.2, 3.0),
+    "hue": (-180.0, 180.0),
+    "camera_x": (-0.3, 0.3),
+    "camera_y": (-0.3, 0.3),
+    "camera_z": (-0.3, 0.5),
+    "distractors": (0.0, 20.0),
+}
 
 
 class UnusableBench(SetupError):
@@ -166,16 +181,19 @@ class BenchSchema(Settings):
                     f"objects.{name}: layouts have this key for something else; allowed: another"
                 )
         for name, factor in self.factors.items():
-            if name == "size" and factor.low <= 0.0:
-                raise SetupError(f"factors.size.low = {factor.low:g}; allowed: more than 0")
-            if not factor.low <= factor.usual <= factor.high:
+            low, high = _RANGES[name]
+            if not low <= factor.low <= factor.high <= high:
                 raise SetupError(
-                    f"factors.{name}.usual = {factor.usual:g}; allowed: {factor.low:g} to {factor.high:g}"
+                    f"factors.{name}: low = {factor.low:g}, high = {factor.high:g}; allowed: {low:g} to {high:g}"
                 )
+            whole = name != "distractors" or factor.usual == int(factor.usual)
+            if not (factor.low <= factor.usual <= factor.high and whole):
+                number = "a whole number from " if name == "distractors" else ""
+                raise SetupError(
+                    f"factors.{name}.usual = {factor.usual:g}; allowed: {number}{factor.low:g} to {factor.high:g}"
+                )
+        self._require_objects()
         self._require_milestones()
-        for names in self.together:
-            if strangers := [name for name in names if name not in self.objects]:
-                raise SetupError(f"together = {strangers}; allowed: names of {', '.join(self.objects)}")
         for pair in self.apart:
             named = [*pair.objects, *pair.others]
             if not pair.pairs or len(set(named)) < len(named) or not set(named) <= set(self.objects):
@@ -186,6 +204,51 @@ class BenchSchema(Settings):
         if problem := next(self.problems({name: thing.example for name, thing in self.objects.items()}), ""):
             raise SetupError(f"the examples are no layout: {problem}")
         return self
+
+    def _require_objects(self) -> None:
+        x_from, x_to, y_from, y_to = self.area
+        for name, thing in self.objects.items():
+            if thing.area is None:
+                continue
+            x_low, x_high, y_low, y_high = thing.area
+            if not (x_from <= x_low <= x_high <= x_to and y_from <= y_low <= y_high <= y_to):
+                raise SetupError(
+                    f"objects.{name}.area = {thing.area}; allowed: x from, x to, y from, y to, within the bench's "
+                    f"{self.area}"
+                )
+        if not all(abs(edge) <= _FARTHEST for edge in self.area):
+            raise SetupError(f"area = {self.area}; allowed: within {_FARTHEST:g} m of the middle")
+        grouped = [name for names in self.together for name in names]
+        if strangers := [name for name in grouped if name not in self.objects]:
+            raise SetupError(f"together = {strangers}; allowed: names of {', '.join(self.objects)}")
+        if len(set(grouped)) < len(grouped):
+            raise SetupError(f"together = {self.together}; allowed: each object once")
+        if (
+            "distractors" in self.factors
+            and self.factors["distractors"].high > 0
+            and not self.distinct_colours
+        ):
+            raise SetupError(
+                f"distractors.colours = {self.distractors.colours}; allowed: one or more that no box has, because "
+                "distractors are like the first box otherwise"
+            )
+
+    @property
+    def distinct_colours(self) -> list[list[int]]:
+        """Colours of distractors that no box has: a distractor must not be taken for an object of the task."""
+        used = [box.colour for box in self.boxes.values()]
+        return [colour for colour in self.distractors.colours if colour not in used]
+
+    def distractor_colour(self, number: int) -> list[int]:
+        """Return the colour of a distractor, counted from 0; that of the first box if the schema has no other."""
+        palette = self.distinct_colours or [next(iter(self.boxes.values())).colour]
+        return palette[number % len(palette)]
+
+    @property
+    def digest(self) -> str:
+        """Digest of everything that the schema declares; two benches with the same digest are the same bench."""
+        content = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return f"sha256:{hashlib.sha256(content.encode()).hexdigest()}"
 
     def _require_milestones(self) -> None:
         for name, milestone in self.milestones.items():
@@ -292,12 +355,14 @@ class BenchSchema(Settings):
 
 
 def is_place(value: Any, count: int) -> bool:
-    """Return True for a list or tuple of `count` finite numbers."""
+    """Return True for a list or tuple of `count` finite numbers, none of which is huge."""
     return (
         isinstance(value, list | tuple)
         and len(value) == count
         and all(
-            isinstance(part, int | float) and not isinstance(part, bool) and math.isfinite(part)
+            isinstance(part, int | float)
+            and not isinstance(part, bool)
+            and abs(part) < _LARGEST  # False for NaN; an int of any size can be compared
             for part in value
         )
     )
@@ -315,9 +380,9 @@ def load_schema(bench: str) -> BenchSchema:
     Raises:
         UnusableBench: If there is none, or its file is invalid.
     """
-    folder = FOLDER / bench if bench in installed_benches() else Path(bench).expanduser()
-    file = folder / FILE
+    file = Path(bench, FILE)
     try:
+        file = (FOLDER / bench if bench in installed_benches() else Path(bench).expanduser()) / FILE
         tree = tomllib.loads(file.read_text(encoding="utf-8"))
         return BenchSchema.model_validate(tree)
     except FileNotFoundError:
@@ -328,5 +393,9 @@ def load_schema(bench: str) -> BenchSchema:
         raise UnusableBench(f"{file}: {error}") from error
     except ValidationError as invalid:
         raise UnusableBench(explain_validation_error(invalid, BenchSchema, tree, str(file))) from invalid
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UnusableBench(f"{file}: {error}") from error
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+    ) as error:  # no such home, nested too deeply, no UTF-8, no TOML, a NUL
+        raise UnusableBench(f"{str(file)!r:.300}: {error}") from error

@@ -50,8 +50,8 @@ class BenchRequest(Settings):
 
     `positions` are the places of the bench's objects by name in the world frame: x, y [m] and, of objects that can be
     turned, yaw [degrees]. Objects without a place are laid anywhere. `factors` are values of the bench's factors by
-    name; the others are as usual. The bench's own schema decides what it accepts. `of` is the installed bench that the
-    layout belongs to; absent, any bench that accepts it.
+    name; the others are as usual. The bench's own schema decides what it accepts. `of` is the bench that the layout
+    belongs to, by name or folder, and `schema_digest` the digest of its schema; absent, any bench that accepts it.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
@@ -59,6 +59,7 @@ class BenchRequest(Settings):
     positions: Annotated[dict[str, Place], Field(max_length=100)] | None = None
     factors: Annotated[dict[str, float], Field(max_length=20)] | None = None
     of: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    schema_digest: Annotated[str, Field(max_length=80)] | None = None
 
 
 class LeastTimes(Settings):

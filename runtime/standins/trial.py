@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -54,6 +56,11 @@ def parser() -> argparse.ArgumentParser:
     )
     line.add_argument("--width", type=int, default=640, help="of each picture")
     line.add_argument("--height", type=int, default=480)
+    line.add_argument(
+        "--lifeline",
+        action="store_true",
+        help="the orders are the first line of standard input, whose end kills this process",
+    )
     return line
 
 
@@ -108,13 +115,23 @@ def run_trial(options: argparse.Namespace, orders: Mapping[str, dict[str, Any]])
         )
 
 
+def _die_with_input() -> None:
+    """Kill this process when standard input ends: who ordered the trial is gone, and may have it run again."""
+    while sys.stdin.read(1):
+        pass
+    os._exit(1)
+
+
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the trial that standard input describes, and print its result."""
     options = parser().parse_args(arguments)
     log.configure_logging("trial")
     try:
-        done = run_trial(options, read_orders(sys.stdin.read()))
+        orders = read_orders(sys.stdin.readline() if options.lifeline else sys.stdin.read())
+        if options.lifeline:
+            threading.Thread(target=_die_with_input, name="lifeline", daemon=True).start()
+        done = run_trial(options, orders)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2

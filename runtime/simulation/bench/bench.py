@@ -86,7 +86,6 @@ class Bench:
         self.discs = tuple(_disc_shape(name, disc) for name, disc in schema.discs.items())
         self._edges = tuple(_edge(name, box) for name, box in schema.boxes.items())
         self._colours = tuple(_colour(box.colour) for box in schema.boxes.values())
-        self._distractor_colours = tuple(map(_colour, schema.distractors.colours))
 
     @property
     def block_edge(self) -> float:
@@ -105,11 +104,10 @@ class Bench:
         return self._edges[block] if block < len(self._edges) else self._edges[0]
 
     def colour(self, block: int) -> Colour:
-        """Return the colour of the block of that number; distractors have those of the schema in turn."""
+        """Return the colour of the block of that number; distractors have colours of the schema in turn."""
         if block < len(self._colours):
             return self._colours[block]
-        palette = (self._colours[0], *self._distractor_colours)
-        return palette[block % len(palette)]
+        return _colour(self.schema.distractor_colour(block - len(self._colours)))
 
 
 def _turn(colour: Colour, hue: float) -> Colour:

@@ -29,6 +29,9 @@ _OTHER_BENCH = Pattern(
     "bench.other_bench",
     "setup: the scene is laid out for the simulated bench {wanted!r}; this station has {own!r}",
 )
+_SAME_NAME = fixed(
+    "bench.same_name", ", whose bench.toml is another one: start the station, or the lab, anew after a change"
+)
 _NO_LAYOUT = Pattern("bench.no_layout", "setup: bench.positions: {why}")
 _CANNOT_RESET = Pattern("bench.cannot_reset", "the bench cannot be reset: {why}")
 _NOT_RESET = Pattern("bench.not_reset", "the bench was not reset within {seconds:g} s: {why}")
@@ -67,15 +70,19 @@ class BenchReset:
         if not self._plan.capabilities.bench:
             raise SetupError(_NOT_SIMULATED(seed=bench.seed))
         own = self._plan.capabilities.bench
-        if bench.of is not None and bench.of != own:
-            raise SetupError(_OTHER_BENCH(wanted=bench.of, own=own))
         schema = load_schema(own)
+        if bench.schema_digest is not None and bench.schema_digest != schema.digest:
+            same = _SAME_NAME if bench.of == own else ""
+            raise SetupError(_OTHER_BENCH(wanted=bench.of or "", own=own) + same)
+        if bench.schema_digest is None and bench.of is not None and bench.of != own:
+            raise SetupError(_OTHER_BENCH(wanted=bench.of, own=own))
         problems = (*schema.problems(bench.positions or {}), *schema.factor_problems(bench.factors or {}))
         if problems:
             raise SetupError(_NO_LAYOUT(why=problems[0]))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
             raise SetupError(_RESET_ALREADY(identity=bench.id))
-        return bench.model_dump(exclude_none=True, exclude={"of"}) | {"id": bench.id or str(uuid.uuid4())}
+        asked = bench.model_dump(exclude_none=True, exclude={"of", "schema_digest"})
+        return asked | {"id": bench.id or str(uuid.uuid4())}
 
     def start(self, reset: dict[str, Any]) -> None:
         """Begin to request `reset`, the result of `from_request`; `is_done` sends and repeats the request."""

@@ -52,7 +52,7 @@ def test_masses_and_friction_are_multiplied_and_come_back(table: ContactTabletop
     assert model.body_mass[body] == pytest.approx(3 * mass)
     np.testing.assert_allclose(model.body_inertia[body], 3 * inertia)
     np.testing.assert_allclose(model.geom_friction[:, 0], friction / 2)
-    lay(table, "g", friction=2.0)
+    lay(table, "g", friction=1.25)
     assert model.geom_friction[:, 0].max() <= 1.0
     lay(table, "h")
     assert model.body_mass[body] == pytest.approx(mass)
