@@ -117,7 +117,7 @@ class Pickup:
         close_old_connections()
         yield "the simulated bench"
         assignments = yield from simulated.bring(
-            self._processes, stored.name, resolved.deployment.robot, self._how
+            self._processes, stored.name, resolved.deployment.robot, stored.path, self._how
         )
         yield "the station"
         bench = Bench(stored.path, assignments)

@@ -109,10 +109,9 @@ def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
     )
 
 
-def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tuple[str, ...]:
-    """Return the arguments of runtime.standins.serve for a scripted policy that uses the images."""
-    kind = ("openpi", "--robot", robot, "--behaviour", "pick_place")
-    return (*kind, "--name", name, "--port", str(port), *options)
+def serving(name: str, robot: str, options: Sequence[str]) -> tuple[str, ...]:
+    """Return the arguments of runtime.standins.serve, without port, for a scripted policy that uses the images."""
+    return ("openpi", "--robot", robot, "--behaviour", "pick_place", "--name", name, *options)
 
 
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
@@ -122,7 +121,7 @@ def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Prog
     """
 
     def arguments(port: object) -> tuple[str, ...]:
-        return ("-m", "runtime.standins.serve", *_serving(name, robot, options, port))
+        return ("-m", "runtime.standins.serve", *serving(name, robot, options), "--port", str(port))
 
     return ProgramSpec(
         f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(port_of(found))
@@ -145,7 +144,7 @@ def lockstep(
     served = [
         part
         for name, (skill, port) in policies.items()
-        for part in ("--serve", shlex.join(_serving(name, robot, skill, port)))
+        for part in ("--serve", shlex.join((*serving(name, robot, skill), "--port", str(port))))
     ]
     arguments = ("-m", "runtime.standins.lockstep", deployment, *sets, *served, *options)
     return ProgramSpec(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)

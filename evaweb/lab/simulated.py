@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from evaweb.core.errors import EvaError
-from evaweb.lab import demo_rows, lifetime, programs
+from evaweb.lab import demo_rows, farm, lifetime, programs
 from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec
 from evaweb.trials.models import Checkpoint
 
@@ -62,6 +64,28 @@ class Benches:
         """Return the command-line options of a policy's server that determine its skill."""
         return (*POLICIES[policy].skill, "--seed", str(self.seed))
 
+    def write_copies(
+        self, station: str, robot: str, deployment: Path, urls: Mapping[str, str], assignments: Sequence[str]
+    ) -> None:
+        """Record how copies of a station are started for trials without people.
+
+        Args:
+            station: Name of the station.
+            robot: Name of its robot.
+            deployment: Deployment file of the station.
+            urls: Name of each policy server -> its address; the names begin with those of POLICIES.
+            assignments: Assignments that the station has beside its endpoints.
+        """
+        servers = {}
+        for name, url in urls.items():
+            policy = next(known for known in POLICIES if name.startswith(known))
+            line = shlex.join(programs.serving(name, robot, self.skill(policy)))
+            servers[url] = {"line": line, "delay_ms": POLICIES[policy].latency_ms}
+        first = [f"policy.url={json.dumps(url)}" for url in [*urls.values()][:1]]
+        farm.write_copies(
+            station, farm.Copies(str(deployment), [*first, *assignments], self.options, servers)
+        )
+
     def server(self, policy: str) -> tuple[str, ...]:
         """Return the command-line options of a policy's server in real time: its skill and its latency."""
         return (*self.skill(policy), "--latency-ms", str(POLICIES[policy].latency_ms))
@@ -94,7 +118,7 @@ def benches_of(options: Mapping[str, Any]) -> Benches:
 
 
 def bring(
-    processes: ChildProcesses, station: str, robot: str, how: Benches
+    processes: ChildProcesses, station: str, robot: str, deployment: Path, how: Benches
 ) -> Generator[str, None, list[str]]:
     """Start bench and policies of a station step by step; yield the name of each as it is started.
 
@@ -111,11 +135,12 @@ def bring(
             demo_rows.demo_checkpoint(
                 name=name, description=scripted.description, policy={"url": addresses["url"]}
             )
-    url = _url_of(f"{SKILLED}-{robot}")
+    urls = {name: _url_of(name) for name in (f"{policy}-{robot}" for policy in POLICIES)}
+    how.write_copies(station, robot, deployment, urls, how.assignments)
     return [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',
         f'transport.pub_endpoint="{node["action_endpoint"]}"',
-        f"policy.url={json.dumps(url)}",
+        f"policy.url={json.dumps(urls[f'{SKILLED}-{robot}'])}",
         *how.assignments,
     ]
 

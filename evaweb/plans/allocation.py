@@ -27,7 +27,7 @@ from evaweb.plans.design import (
 )
 from evaweb.plans.frozen_document import require_checkpoints, require_scene, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
-from evaweb.plans.selectors import without_dropped
+from evaweb.plans.selectors import needed_handouts, without_dropped
 from evaweb.plans.services import end_plan_if_decided, slots_of
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
@@ -74,11 +74,11 @@ def plan_progress(plan: Plan) -> Progress:
     """Return the progress of a plan, without revealing any checkpoint."""
     slots = _with_newest(plan.slots.all())
     counted = slots.filter(newest=TrialStatus.SCORED).count()
-    return Progress(plan.slots.count(), counted, plan.handouts.count())
+    return Progress(plan.slots.count(), counted, needed_handouts(plan).count())
 
 
-def allocate_trial(*, user: User, station: Station, plan: Plan) -> Handout:
-    """Prepare the next trial of `plan` on `station`.
+def allocate_trial(*, user: User, station: Station, plan: Plan, worker: str = "") -> Handout:
+    """Prepare the next trial of `plan` on `station`, or on its copy `worker`.
 
     Raises:
         Conflict: No slot is left for the station, its last trial is unfinished, or scene or checkpoint have changed.
@@ -86,16 +86,18 @@ def allocate_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     """
     require_role(user, Role.OPERATOR)
     _check(plan, user, station)
-    require_none_open(station)  # before evaluating the design, so that the message reveals nothing about it
+    require_none_open(
+        station, worker
+    )  # before evaluating the design, so that the message reveals nothing about it
     with transaction.atomic():  # committed even if no trial is handed out
         locked = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
         lapse_void_requests(Trial.objects.filter(handout__plan=locked), user=user)
     end_plan_if_decided(user=user, plan=plan, asked=True)
-    return _allocate(user, station, plan)
+    return _allocate(user, station, plan, worker)
 
 
 @transaction.atomic
-def _allocate(user: User, station: Station, plan: Plan) -> Handout:
+def _allocate(user: User, station: Station, plan: Plan, worker: str) -> Handout:
     locked = (
         Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     )
@@ -117,6 +119,7 @@ def _allocate(user: User, station: Station, plan: Plan) -> Handout:
         number=slot.repetition,
         attempt=before.attempt + 1 if before else 1,
         strategy=(locked.document or {}).get("strategy"),
+        worker=worker,
     )
     return Handout.objects.create(
         plan=locked,

@@ -81,6 +81,11 @@ def remaining(plan: Plan, dropped: Mapping[str, int] | None = None) -> int:
     return without_dropped(plan.slots.exclude(pk__in=counted), dropped or {}).count()
 
 
+def needed_handouts(plan: Plan) -> QuerySet[Handout]:
+    """Return the handouts of a plan, except of trials that were begun beside the one with which its design ended."""
+    return plan.handouts.exclude(trial__status=TrialStatus.NOT_NEEDED)
+
+
 def without_dropped(slots: QuerySet[Slot], dropped: Mapping[str, int]) -> QuerySet[Slot]:
     """Exclude the slots of each dropped checkpoint, from the block on at which it was dropped."""
     for name, at in dropped.items():

@@ -28,6 +28,7 @@ class Transition(StrEnum):
     VOID = "voided"
     KEEP = "kept"
     ABANDON = "abandoned"
+    DISMISS = "dismissed"
 
 
 _S = TrialStatus
@@ -54,6 +55,10 @@ TRANSITIONS: dict[tuple[TrialStatus, Transition], TrialStatus] = {
     (_S.SCORED, Transition.ASK): _S.VOID_ASKED,  # in a blind plan, where a second operator has to agree
     (_S.VOID_ASKED, Transition.VOID): _S.VOIDED,
     (_S.VOID_ASKED, Transition.KEEP): _S.SCORED,
+    # Run at the same time as the trial with which the plan's design ended: it is no attempt, and in no figure.
+    (_S.PREPARED, Transition.DISMISS): _S.NOT_NEEDED,
+    (_S.ENDED, Transition.DISMISS): _S.NOT_NEEDED,
+    (_S.INTERRUPTED, Transition.DISMISS): _S.NOT_NEEDED,
 }
 
 OPEN_STATES = (_S.PREPARED, _S.RUNNING, _S.PAUSED)
@@ -72,6 +77,7 @@ _ADVICE = {
     _S.VOID_ASKED: "a second operator agrees or refuses on its page",
     _S.VOIDED: "repeat it as a new attempt",
     _S.ABANDONED: "prepare another one",
+    _S.NOT_NEEDED: "the plan's design had ended, or dropped its checkpoint, before it",
 }
 
 

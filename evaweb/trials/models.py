@@ -74,6 +74,14 @@ class Scene(models.Model):
         """Schema of the simulated bench. Raises: UnusableBench if its folder is absent or invalid."""
         return load_schema(self.bench)
 
+    @property
+    def bench_digest(self) -> str:
+        """Digest of the simulated bench's schema; "" if its folder is absent or invalid."""
+        try:
+            return self.schema.digest
+        except UnusableBench:
+            return ""
+
 
 class Position(models.Model):
     """Initial condition of a scene, by number."""
@@ -338,6 +346,7 @@ class TrialStatus(models.TextChoices):
     VOID_ASKED = "void_asked", "void asked for"
     VOIDED = "voided", "voided"
     ABANDONED = "abandoned", "never run"
+    NOT_NEEDED = "not_needed", "not needed"
 
     @property
     def tone(self) -> str:
@@ -355,6 +364,7 @@ _TONES = {
     TrialStatus.VOID_ASKED: "warn",
     TrialStatus.VOIDED: "neutral",
     TrialStatus.ABANDONED: "neutral",
+    TrialStatus.NOT_NEEDED: "neutral",
 }
 
 
@@ -376,6 +386,12 @@ class Trial(models.Model):
     )
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="trials")
     operator = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="trials")
+    worker = models.CharField(
+        max_length=60,
+        blank=True,
+        editable=False,
+        help_text="Of a trial that a program carries out: which copy of the simulated station runs it.",
+    )
     status = models.CharField(max_length=12, choices=TrialStatus, default=TrialStatus.PREPARED)
     reason = models.TextField(blank=True, help_text="Why it is where it is, in one sentence.")
     instruction = models.TextField(help_text="As the policy was given it.")
@@ -482,7 +498,7 @@ class Trial(models.Model):
                 name="trial_attempt_once",
             ),
             models.UniqueConstraint(
-                fields=("station",),
+                fields=("station", "worker"),
                 condition=models.Q(status__in=("prepared", "running", "paused")),
                 name="trial_one_open_per_station",
             ),

@@ -31,6 +31,10 @@ _MILESTONE_NOT_ANSWERED_SAY_TRUE = Pattern(
     "trials.verdicts.milestone_not_answered_say_true",
     "milestone {missing} is not answered: say true or false for each of {names}",
 )
+_TRUTH_SILENT = Pattern(
+    "trials.verdicts.truth_silent",
+    "milestone {text!r} is {name!r} in the bench's truth, which reports {reports}: a person scores it",
+)
 _TIMES_MILESTONE_NOT_ONE_THIS = Pattern(
     "trials.verdicts.times_milestone_not_one_this",
     "times: milestone {key!r} is not one of this scene; allowed: {known}",
@@ -113,6 +117,33 @@ def reached_in_truth(truth: Mapping[str, Any], milestone: Milestone) -> bool | N
     at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
     late = at is not None and limit is not None and at > limit
     return None if reached is None else bool(reached) and not late
+
+
+def truth_ticks(
+    milestones: Sequence[Milestone], truth: Mapping[str, Any], *, ordered: bool
+) -> tuple[dict[int, bool], dict[int, float]]:
+    """Return by id which milestones count by the bench's ground truth, and when these were reached [s].
+
+    Too late does not count, nor, if `ordered`, before an earlier milestone.
+
+    Raises:
+        EvaError: If the bench does not report on a milestone.
+    """
+    counts: dict[int, bool] = {}
+    times: dict[int, float] = {}
+    missed, last = False, 0.0
+    for milestone in milestones:
+        reached = reached_in_truth(truth, milestone)
+        if reached is None:
+            reports = ", ".join(truth.get("milestones", {})) or "no milestone"
+            raise EvaError(_TRUTH_SILENT(text=milestone.text, name=milestone.truth, reports=reports))
+        at = truth.get("reached", {}).get(milestone.truth)
+        early = at is not None and at < last
+        counts[milestone.pk] = reached and not (ordered and (missed or early))
+        missed |= not counts[milestone.pk]
+        if counts[milestone.pk] and at is not None:
+            times[milestone.pk] = last = at
+    return counts, times
 
 
 def _answers(milestones: Sequence[Milestone], ticks: Mapping[object, object]) -> dict[int, bool]:

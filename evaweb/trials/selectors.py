@@ -135,9 +135,12 @@ def evaluation_list() -> QuerySet[Evaluation]:
     return Evaluation.objects.select_related("station")
 
 
-def trial_open(station: Station) -> Trial | None:
-    """Return the station's unfinished trial: prepared, running, paused, or ended and not scored."""
-    unfinished = Trial.objects.filter(station=station, status__in=UNFINISHED).order_by("-pk")
+def trial_open(station: Station, worker: str = "") -> Trial | None:
+    """Return the unfinished trial of the station, or of its copy `worker`.
+
+    Unfinished trials are prepared, running, paused, or ended and not scored.
+    """
+    unfinished = Trial.objects.filter(station=station, worker=worker, status__in=UNFINISHED).order_by("-pk")
     return unfinished.select_related(*_NAMED).first()
 
 

@@ -42,8 +42,8 @@ from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, journal_uui
 from evaweb.trials.scoring import (
     LONGEST_NOTE,
     ScoredOutcome,
-    reached_in_truth,
     score_outcome,
+    truth_ticks,
 )
 from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import apply_station_event
@@ -116,6 +116,7 @@ __all__ = [
     "apply_station_event",
     "create_trial",
     "declare_failing",
+    "dismiss_trial",
     "failing",
     "open_bench",
     "prepare_trial",
@@ -266,8 +267,9 @@ def create_trial(
     attempt: int,
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
+    worker: str = "",
 ) -> Trial:
-    """Create a prepared trial with exactly this number and attempt.
+    """Create a prepared trial with exactly this number and attempt, at the station or at its copy `worker`.
 
     The caller has found out, in the same transaction, that this number and attempt are the next.
 
@@ -278,7 +280,7 @@ def create_trial(
     require_role(user, Role.OPERATOR)
     _check_choice(station, scene, position, checkpoint, seed)
     Station.objects.select_for_update().get(pk=station.pk)  # serializes preparation at this station
-    require_none_open(station)
+    require_none_open(station, worker)
     if seed is None and station.simulated:
         seed = seed_of(scene, position, number)
     return Trial.objects.create(
@@ -290,6 +292,7 @@ def create_trial(
         number=number,
         attempt=attempt,
         station=station,
+        worker=worker,
         operator=user,
         instruction=scene.instruction,
         time_limit_s=scene.time_limit_s,
@@ -298,9 +301,9 @@ def create_trial(
     )
 
 
-def require_none_open(station: Station) -> None:
-    """Raise Conflict, with advice, if the station has an unfinished trial."""
-    unfinished = trial_open(station)
+def require_none_open(station: Station, worker: str = "") -> None:
+    """Raise Conflict, with advice, if the station, or its copy `worker`, has an unfinished trial."""
+    unfinished = trial_open(station, worker)
     if unfinished is not None:
         status = TrialStatus(unfinished.status)
         raise Conflict(
@@ -350,7 +353,8 @@ def score_trial(
     rater's current one. Then the first score is returned.
 
     Args:
-        milestones: Milestone id -> reached, for every milestone of the scene.
+        milestones: Milestone id -> reached, for every milestone of the scene; empty with source truth: as the bench's
+            ground truth has them, with their times.
         times: Milestone id -> time of reaching it [s after the start of the run], if known. If `times` is None in a
             correction, the times of the current score are taken.
         failure, failure_phase: See `failures.check_failure`.
@@ -371,6 +375,10 @@ def score_trial(
         locked = lock_trial(trial)
         run_checks("judged", locked, user)
         rows = list(locked.scene.milestones.order_by("order"))
+        if source == Score.Source.TRUTH and not milestones and locked.truth is not None:
+            milestones, times = truth_ticks(rows, locked.truth, ordered=locked.scene.ordered)
+            if success is None and not any(row.required for row in rows):
+                success = bool(locked.truth.get("success"))
         when = _times_before(locked, rows, milestones) if times is None else times
         fails = bool(failing(locked))
         judged = partial(
@@ -432,6 +440,17 @@ def abandon_trial(*, user: User, trial: Trial, reason: str = "") -> Trial:
     return trial
 
 
+@transaction.atomic
+def dismiss_trial(*, trial: Trial, reason: str) -> Trial:
+    """Set aside a trial that a program has begun and that its plan does not need any more; others are unchanged."""
+    locked = lock_trial(trial)
+    if locked.worker and lifecycle.allows(locked, Transition.DISMISS):
+        lifecycle.apply(locked, Transition.DISMISS)
+        locked.reason = reason
+        locked.save()
+    return locked
+
+
 def request_publication(trial: Trial) -> None:
     """Queue the publication of the trial's episode to the dataset with its current score."""
     if trial.episode is not None:
@@ -466,8 +485,10 @@ def _require_truth(trial: Trial, outcome: ScoredOutcome) -> None:
     """
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
+    milestones = [milestone for milestone, _, _ in outcome.reached]
+    counts, _ = truth_ticks(milestones, trial.truth, ordered=trial.scene.ordered)
     for milestone, reached, _ in outcome.reached:
-        truth = bool(reached_in_truth(trial.truth, milestone))
+        truth = counts[milestone.pk]
         if reached != truth:
             raise EvaError(
                 _BENCH_SAYS_OTHERWISE(milestone=milestone.text, said=reached, trial=trial.pk, truth=truth)

@@ -26,7 +26,6 @@ from evaweb.trials.record import TrialRecord
 from evaweb.trials.services import run_checks
 from evaweb.trials.station_events import begin_run
 from evaweb.trials.tables import simulated_bench
-from runtime.benches.schema import DEFAULT_BENCH, installed_benches
 from runtime.core.sentences import Pattern, fixed
 
 _CHECKPOINT_OF_SETUP_ALONE = Pattern(
@@ -152,8 +151,8 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     if trial.station.simulated and trial.seed is not None:
         laid = simulated_bench(trial.position.bench)
         args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": laid}
-        if trial.scene.bench != DEFAULT_BENCH and trial.scene.bench in installed_benches():
-            args["bench"]["of"] = trial.scene.bench  # without a layout, any bench would accept the scene
+        # Without a layout, any bench would accept the scene.
+        args["bench"] |= {"of": trial.scene.bench, "schema_digest": trial.scene.bench_digest}
         if factors := (trial.position.bench or {}).get("factors"):
             args["bench"]["factors"] = factors
     return args

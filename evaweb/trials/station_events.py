@@ -7,24 +7,31 @@ newest event that it has processed, and ignores older ones.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any
 from uuid import UUID
 
 from django.db import transaction
 from django.utils import timezone
 
+from evaweb.core.errors import EvaError
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.services import record_opened, request_publish
+from evaweb.episodes.services import record_closed, record_opened, request_publish
 from evaweb.stations.commands import resolve_unknown_outcome
 from evaweb.stations.models import Command, Station
 from evaweb.trials import lifecycle
 from evaweb.trials.endings import ending_of
 from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import Trial, TrialStatus
+from runtime.core.sentences import Pattern
 from runtime.ipc.session_state import SessionState
 
 log = logging.getLogger(__name__)
+_NOT_RECORDED = Pattern(
+    "trials.station_events.not_recorded",
+    "trial {trial} was not recorded: its run ended {state}: {reason}",
+)
 
 
 def apply_station_event(
@@ -70,10 +77,47 @@ def begin_run(trial: Trial, *, command: Command, episode: UUID | None) -> None:
     trial.save()
 
 
+@transaction.atomic
+def record_whole_run(*, trial: Trial, events: Sequence[Mapping[str, Any]], state: str, reason: str) -> Trial:
+    """Record a run that one program has carried out from beginning to end, without commands and without a live station.
+
+    A trial whose run is recorded already is unchanged.
+
+    Args:
+        trial: A prepared trial whose recording is in the lab's folder of episodes.
+        events: Rows of the station's event log: number, kind, text, time [s], wall [s since 1970], data.
+        state: State of the session at the end of the run.
+        reason: Why the run ended.
+
+    Raises:
+        EvaError: If no recording was opened and closed.
+    """
+    locked = Trial.objects.select_for_update().get(pk=trial.pk)
+    if locked.status != TrialStatus.PREPARED:
+        return locked
+    by_kind = {str(event["kind"]): event for event in events}
+    opened, closed = by_kind.get("episode_opened"), by_kind.get("episode_closed")
+    uuid = _uuid((closed or {}).get("data", {}).get("uuid"))
+    if opened is None or closed is None or uuid is None:
+        raise EvaError(_NOT_RECORDED(trial=locked.pk, state=state, reason=reason))
+    lifecycle.apply(locked, Transition.RUN)
+    locked.started_at = datetime.fromtimestamp(opened["wall"], UTC)
+    locked.run_since = _time(opened)
+    locked.episode = _episode(locked, uuid)
+    _apply_transition(locked, _transition_for(state, {}), reason, _time(closed))
+    if locked.status not in (TrialStatus.ENDED, TrialStatus.INTERRUPTED):
+        _apply_transition(locked, Transition.INTERRUPT, reason, None)
+    locked.ended_at = datetime.fromtimestamp(closed["wall"], UTC)
+    locked.truth = dict(by_kind["truth"]["data"]) if "truth" in by_kind else None
+    locked.save()
+    record_closed(station=locked.station, data=closed["data"])
+    return _episode_closed(locked.station, closed) or locked
+
+
 def _may_begin(trial: Trial) -> bool:
-    open_trials = Trial.objects.filter(station=trial.station, status__in=lifecycle.OPEN_STATES).exclude(
-        pk=trial.pk
-    )
+    open_trials = Trial.objects.filter(
+        station=trial.station, worker=trial.worker, status__in=lifecycle.OPEN_STATES
+    ).exclude(pk=trial.pk)
     if lifecycle.allows(trial, Transition.RUN) and not open_trials.exists():
         return True
     log.error("trial %s is %s, but %s accepted its run", trial.pk, trial.status, trial.station.name)
@@ -136,7 +180,7 @@ def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | Non
 def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
     data = event.get("data") or {}
     state = data.get("state") or data.get("to")
-    trial = _lock_latest(station=station, status__in=lifecycle.RUNNING_STATES)
+    trial = _lock_latest(station=station, worker="", status__in=lifecycle.RUNNING_STATES)
     if trial is None or not state:
         return None
     if trial.run_boot != boot:

@@ -23,7 +23,7 @@ from evaweb.plans.counting import end_of
 from evaweb.plans.design import Names, compared
 from evaweb.plans.models import Achieved, CameraCheck, Plan
 from evaweb.plans.models import Look as Behind
-from evaweb.plans.selectors import overlapping_plans
+from evaweb.plans.selectors import needed_handouts, overlapping_plans
 from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.analysis.integrity import checkpoint_changes, with_changes
 from evaweb.statistics.multiple_comparisons import holm
@@ -48,7 +48,8 @@ class AttemptRecord:
     """One attempt of a plan. All delays are in s, and None if unknown.
 
     `match` is the smallest agreement of a camera's image with its reference at the last bench check before the run;
-    `override` is the reason for which a low match was accepted.
+    `override` is the reason for which a low match was accepted. `worker` is the copy of a simulated station that ran
+    it, "" for a trial of a person: nobody checks cameras of a copy, and copies run at the same time.
     """
 
     number: int
@@ -72,6 +73,7 @@ class AttemptRecord:
     connect: float | None
     warm_up: float | None
     latency: float | None
+    worker: str = ""
     ended: str = ""
 
     @property
@@ -150,15 +152,17 @@ def all_attempts(plan: Plan, looks: Iterable[BenchImage]) -> list[AttemptRecord]
     )
     own = ("status", "attempt", "operator__username", "station__name", "started_at", "ended_at")
     voided = ("reason", "voided_at", "voided_by__username")
-    rows, accepted = plan.handouts.order_by("number"), _accepted(looks)
-    end_fields = ("trial__setup_took", "trial__episode__policy", "trial__ended_by", "trial__episode__status")
+    rows, accepted = needed_handouts(plan).order_by("number"), _accepted(looks)
+    delays_of = ("trial__setup_took", "trial__episode__policy")
+    end_fields = (*delays_of, "trial__ended_by", "trial__episode__status", "trial__worker")
     attempts = []
     named = [f"trial__{name}" for name in (*own, *voided)]
     for row in rows.values_list(*fields, *named, *end_fields):
-        *plain, took, policy, stored_end, recording = row
+        *plain, took, policy, stored_end, recording, worker = row
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
-        attempt = AttemptRecord(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays)
+        match = accepted.get(row[fields.index("trial_id")], (None, ""))
+        attempt = AttemptRecord(*plain, *match, *delays, worker)
         told_now = attempt.status == TrialStatus.VOIDED and stored_end is None  # its reason is a person's
         attempts.append(
             attempt
@@ -423,8 +427,8 @@ def _span(rows: Iterable[AttemptRecord]) -> float | None:
 
 
 def _is_out_of_order(rows: Iterable[AttemptRecord]) -> bool:
-    """Return True if the trials that count were not run in the drawn order."""
-    slots = [run.slot for run in rows if run.counts]
+    """Return True if the trials that count were not run in the drawn order; copies run several at the same time."""
+    slots = [run.slot for run in rows if run.counts and not run.worker]
     return slots != sorted(slots)
 
 
@@ -434,7 +438,7 @@ def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
     begun: set[int] = set()
     codes = []
     for run in runs:
-        if run.slot not in begun and run.slot < reached.get(run.station, -1):
+        if not run.worker and run.slot not in begun and run.slot < reached.get(run.station, -1):
             codes.append(run.code)
         begun.add(run.slot)
         reached[run.station] = max(reached.get(run.station, -1), run.slot)
@@ -469,7 +473,8 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     unchecked = [
         run.code
         for run in runs
-        if not any(run.handed_at - HOLDS <= at <= run.handed_at for at in times[run.station, run.operator])
+        if not run.worker
+        and not any(run.handed_at - HOLDS <= at <= run.handed_at for at in times[run.station, run.operator])
     ]
     return {"checks": checks, "unchecked": unchecked}
 

@@ -64,7 +64,8 @@ class CheckpointChanges:
 def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
     """Return the changes of each checkpoint by name; the number of queries does not depend on the number of trials."""
     by_checkpoint: dict[str, CheckpointChanges] = {}
-    trials = Trial.objects.filter(handout__plan=plan).order_by("checkpoint__name")
+    needed = Trial.objects.filter(handout__plan=plan).exclude(status=TrialStatus.NOT_NEEDED)
+    trials = needed.order_by("checkpoint__name")
     ends = ("ended_by", "status", "reason", "episode__status", "episode__frames")
     for name, status, success, operator, station, *end, frames in trials.values_list(
         "checkpoint__name", "status", "verdict__success", "operator__username", "station__name", *ends

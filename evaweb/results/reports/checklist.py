@@ -10,6 +10,7 @@ from django.db.models import Count, F, Min
 from evaweb.plans.design import compared
 from evaweb.plans.models import Allocation, Plan
 from evaweb.plans.schedule import IMBALANCE
+from evaweb.plans.selectors import needed_handouts
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.conduct import looked_behind
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT, with_changes
@@ -157,7 +158,7 @@ def _corrections(plan: Plan) -> Item:
 def _versions(plan: Plan) -> Item:
     before, left, version = 0, 0, plan.amends
     while version is not None:
-        before, left = before + bool(version.document), left + version.handouts.count()
+        before, left = before + bool(version.document), left + needed_handouts(version).count()
         version = version.amends
     text = f"version {plan.version}; {before} frozen before it"
     if before:

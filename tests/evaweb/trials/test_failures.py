@@ -90,8 +90,11 @@ def test_a_scene_may_want_both_of_whoever_scores_and_of_no_bench(bench, terms):
             score(bench, trial := bench.ended(), **given)
         voids.void_trial(user=bench.operator, trial=trial, reason="of this test")
     said_by_bench = bench.ended()
-    Milestone.objects.filter(order=1).update(truth="held")
-    Trial.objects.filter(pk=said_by_bench.pk).update(truth={"milestones": {"held": True}})
+    names = ("held", "lifted", "on_plate")
+    for order, name in enumerate(names, 1):
+        Milestone.objects.filter(order=order).update(truth=name)
+    truth = {"milestones": {name: name == "held" for name in names}}
+    Trial.objects.filter(pk=said_by_bench.pk).update(truth=truth)
     assert score(bench, said_by_bench, source="truth").why == ""
     assert score(bench, bench.ended(), success=True).success is True
     FailureTerm.objects.all().delete()

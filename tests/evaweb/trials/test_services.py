@@ -249,7 +249,7 @@ def test_without_any_milestone_the_score_is_the_success(bench):
 
 
 def test_in_the_name_of_a_bench_nobody_scores_anything_but_what_it_says(bench):
-    for order, name in ((1, "held"), (3, "on_plate")):
+    for order, name in ((1, "held"), (2, "lifted"), (3, "on_plate")):
         bench.scene.milestones.filter(order=order).update(truth=name)
     trial = bench.ended()
 
@@ -260,12 +260,46 @@ def test_in_the_name_of_a_bench_nobody_scores_anything_but_what_it_says(bench):
 
     with pytest.raises(EvaError, match=r"the bench of trial .* reported no truth"):
         score(True, False, False)
+    said = {"held": True, "lifted": False, "on_plate": False}
     Trial.objects.filter(pk=trial.pk).update(truth={"milestones": {"held": True, "on_plate": False}})
+    with pytest.raises(EvaError, match="'lifted' in the bench's truth, which reports held, on_plate"):
+        score(True, False, False)
+    Trial.objects.filter(pk=trial.pk).update(truth={"milestones": said})
     for ticks, said in (((True, False, True), "on the plate"), ((True, True, False), "lifted")):
         with pytest.raises(EvaError, match=rf"'{said}' = True, the bench of trial .* says False"):
             score(*ticks)
     assert not trial.scores.exists()
     assert (score(True, False, False).source, trial.scores.count()) == ("truth", 1)
+
+
+@pytest.mark.parametrize(
+    ("ordered", "at", "counts"),
+    [
+        (False, {"held": 1.0, "lifted": 2.0, "on_plate": 3.0}, (True, True, True)),
+        (False, {"held": 1.0, "lifted": 9.0, "on_plate": 3.0}, (True, False, True)),  # too late
+        (
+            True,
+            {"held": 1.0, "lifted": 9.0, "on_plate": 9.5},
+            (True, False, False),
+        ),  # after one that is missed
+        (True, {"held": 4.0, "lifted": 2.0, "on_plate": 5.0}, (True, False, False)),  # before the first
+    ],
+)
+def test_what_the_bench_said_counts_in_time_and_in_order_alone(bench, ordered, at, counts):
+    for order, name in enumerate(at, 1):
+        limit = 5.0 if name == "lifted" else None
+        bench.scene.milestones.filter(order=order).update(truth=name, time_limit_s=limit)
+    bench.scene.ordered = ordered
+    bench.scene.save()
+    trial = bench.ended()
+    truth = {"milestones": dict.fromkeys(at, True), "reached": at, "success": True}
+    Trial.objects.filter(pk=trial.pk).update(truth=truth)
+    made = services.score_trial(user=bench.operator, trial=trial, milestones={}, source="truth")
+    outcomes = list(made.outcomes.order_by("order"))
+    assert tuple(outcome.reached for outcome in outcomes) == counts
+    assert [outcome.at_s for outcome in outcomes] == [
+        seconds if reached else None for seconds, reached in zip(at.values(), counts, strict=True)
+    ]
 
 
 def test_a_success_that_contradicts_the_required_milestones_is_refused(bench):
@@ -551,7 +585,8 @@ def test_only_a_trial_that_never_ran_is_abandoned(bench):
 
 
 def test_the_table_names_every_status_and_nothing_leaves_voided():
-    assert {before for before, _ in TRANSITIONS} | {TrialStatus.VOIDED} == set(TrialStatus)
+    final = {TrialStatus.VOIDED, TrialStatus.NOT_NEEDED}
+    assert {before for before, _ in TRANSITIONS} | final == set(TrialStatus)
     assert {move for _, move in TRANSITIONS} == set(Transition)
     assert not [move for before, move in TRANSITIONS if before is TrialStatus.VOIDED]
 

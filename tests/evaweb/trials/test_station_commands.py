@@ -9,6 +9,7 @@ from evaweb.stations.runtime_client import NoAnswer
 from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.station_commands import trial_command
+from runtime.benches.schema import load_schema
 from tests.evaweb.trials import builders
 from tests.evaweb.trials.builders import BOOT
 
@@ -31,7 +32,13 @@ def test_set_up_takes_policy_task_checkpoint_and_bench_with_it(bench, wire):
         "policy": {"url": "ws://127.0.0.1:8000"},
         "task": "put the block on the plate",
         "checkpoint": {"id": bench.checkpoint.pk, "name": "pi0-block"},
-        "bench": {"id": str(row.pk), "seed": 42, "positions": {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]}},
+        "bench": {
+            "id": str(row.pk),
+            "seed": 42,
+            "positions": {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]},
+            "of": "tabletop",
+            "schema_digest": load_schema("tabletop").digest,
+        },
     }
     assert (command.holder, command.epoch, command.boot, command.sequence) == ("web:ann:p1", 3, BOOT, 5)
     assert trial.setup == row.pk
@@ -50,6 +57,7 @@ def test_a_scene_of_another_bench_names_it_even_without_a_layout(bench, wire):
     bench.scene.positions.update(bench=None)
     row = give(bench, bench.prepare(seed=42), "setup")
     laid = {"id": str(row.pk), "seed": 42, "positions": None, "of": "sorting"}
+    laid["schema_digest"] = load_schema("sorting").digest
     assert heard(wire, "setup")[0].args["bench"] == laid
 
 

@@ -146,7 +146,9 @@ class Command(BaseCommand):
         assignments += _COLLECTS if options["collect"] else ()
         paced = () if options["evaluate"] else ("--paced",)  # in real time for people who watch
         program = programs.lockstep(str(deployment), assignments, robot, policies, (*how.options, *paced))
-        for name, url in lab.processes.start(program)["policies"].items():
+        urls = lab.processes.start(program)["policies"]
+        how.write_copies(_STATION, robot, deployment, urls, assignments)
+        for name, url in urls.items():
             served = {"url": url, "delay_ms": POLICIES[name].latency_ms}
             demo_rows.demo_checkpoint(name=name, description=POLICIES[name].description, policy=served)
         return Bench(deployment, assignments, runs=True)
@@ -160,6 +162,7 @@ class Command(BaseCommand):
             for name in POLICIES
         }
         node, served = bench(), {name: server()["url"] for name, server in servers.items()}
+        how.write_copies(_STATION, robot, deployment, served, [f'robot="{robot}"', *options["set"]])
         for name, scripted in POLICIES.items():
             demo_rows.demo_checkpoint(
                 name=name, description=scripted.description, policy={"url": served[name]}
