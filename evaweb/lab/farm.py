@@ -284,7 +284,7 @@ class _Run:
             retry_while_locked(partial(_score, trial, self._user))
             dropped = dropped_of(self._plan)
             result = findings_of(self._plan)
-            for other in Trial.objects.filter(handout__plan=self._plan, verdict=None).exclude(worker=""):
+            for other in Trial.objects.filter(handout__plan=self._plan, verdict=None).exclude(worker=None):
                 slot = other.handout.slot
                 is_dropped = dropped.get(slot.checkpoint.name, slot.block + 1) <= slot.block
                 if is_dropped or (result is not None and result.ended == "boundary"):
@@ -300,7 +300,7 @@ def _begun_before(plan: Plan, station: Station) -> list[Trial]:
     Raises:
         EvaError: If one is of another plan.
     """
-    rows = Trial.objects.filter(station=station, status__in=UNFINISHED).exclude(worker="")
+    rows = Trial.objects.filter(station=station, status__in=UNFINISHED).exclude(worker=None)
     rows = rows.select_related("handout__plan").order_by("handout__number")
     for trial in rows:
         if trial.handout.plan_id != plan.pk:

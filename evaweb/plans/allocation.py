@@ -77,7 +77,7 @@ def plan_progress(plan: Plan) -> Progress:
     return Progress(plan.slots.count(), counted, needed_handouts(plan).count())
 
 
-def allocate_trial(*, user: User, station: Station, plan: Plan, worker: str = "") -> Handout:
+def allocate_trial(*, user: User, station: Station, plan: Plan, worker: str | None = None) -> Handout:
     """Prepare the next trial of `plan` on `station`, or on its copy `worker`.
 
     Raises:
@@ -97,7 +97,7 @@ def allocate_trial(*, user: User, station: Station, plan: Plan, worker: str = ""
 
 
 @transaction.atomic
-def _allocate(user: User, station: Station, plan: Plan, worker: str) -> Handout:
+def _allocate(user: User, station: Station, plan: Plan, worker: str | None) -> Handout:
     locked = (
         Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     )

@@ -386,8 +386,9 @@ class Trial(models.Model):
     )
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="trials")
     operator = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="trials")
-    worker = models.CharField(
+    worker = models.CharField(  # NULL in place of "": SQLite would rebuild the table, to which guards of others refer
         max_length=60,
+        null=True,
         blank=True,
         editable=False,
         help_text="Of a trial that a program carries out: which copy of the simulated station runs it.",
@@ -498,9 +499,14 @@ class Trial(models.Model):
                 name="trial_attempt_once",
             ),
             models.UniqueConstraint(
-                fields=("station", "worker"),
-                condition=models.Q(status__in=("prepared", "running", "paused")),
+                fields=("station",),
+                condition=models.Q(status__in=("prepared", "running", "paused"), worker=None),
                 name="trial_one_open_per_station",
+            ),
+            models.UniqueConstraint(
+                fields=("station", "worker"),
+                condition=models.Q(status__in=("prepared", "running", "paused"), worker__isnull=False),
+                name="trial_one_open_per_copy",
             ),
         ]
         indexes = [

@@ -115,7 +115,7 @@ class TrialRecord(Line):
     operator: Annotated[str, Field(max_length=150), Column("operator__username", always_visible=True)] = ""
     instruction: Annotated[str, Column(always_visible=True, table=False)]
     seed: Annotated[_Count | None, Column(always_visible=True, table=False)] = None
-    worker: Annotated[str, Field(max_length=60), Column(always_visible=True, table=False)] = ""
+    worker: Annotated[str | None, Field(max_length=60), Column(always_visible=True, table=False)] = None
     strategy: Annotated[dict[str, Any] | None, Column(api="never", table=False)] = None
     time_limit_s: Annotated[_Seconds | None, Column(always_visible=True, table=False)] = None
     prepared_at: Annotated[Moment | None, Column(always_visible=True, table=False, type=datetime)] = None

@@ -135,7 +135,7 @@ def evaluation_list() -> QuerySet[Evaluation]:
     return Evaluation.objects.select_related("station")
 
 
-def trial_open(station: Station, worker: str = "") -> Trial | None:
+def trial_open(station: Station, worker: str | None = None) -> Trial | None:
     """Return the unfinished trial of the station, or of its copy `worker`.
 
     Unfinished trials are prepared, running, paused, or ended and not scored.

@@ -267,7 +267,7 @@ def create_trial(
     attempt: int,
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
-    worker: str = "",
+    worker: str | None = None,
 ) -> Trial:
     """Create a prepared trial with exactly this number and attempt, at the station or at its copy `worker`.
 
@@ -301,7 +301,7 @@ def create_trial(
     )
 
 
-def require_none_open(station: Station, worker: str = "") -> None:
+def require_none_open(station: Station, worker: str | None = None) -> None:
     """Raise Conflict, with advice, if the station, or its copy `worker`, has an unfinished trial."""
     unfinished = trial_open(station, worker)
     if unfinished is not None:

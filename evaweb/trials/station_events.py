@@ -180,7 +180,7 @@ def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | Non
 def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
     data = event.get("data") or {}
     state = data.get("state") or data.get("to")
-    trial = _lock_latest(station=station, worker="", status__in=lifecycle.RUNNING_STATES)
+    trial = _lock_latest(station=station, worker=None, status__in=lifecycle.RUNNING_STATES)
     if trial is None or not state:
         return None
     if trial.run_boot != boot:

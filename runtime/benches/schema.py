@@ -60,8 +60,8 @@ class Box(_Placed):
     """Box that stands on the table."""
 
     shape: Literal["box"]
-    size: Annotated[list[Length], Field(min_length=3, max_length=3)]
-    """Edges along x, y and z at yaw 0 [m]."""
+    size: Annotated[list[Annotated[float, Field(ge=0.005, le=0.3)]], Field(min_length=3, max_length=3)]
+    """Edges along x, y and z at yaw 0 [m], all equal."""
 
     @property
     def numbers(self) -> tuple[str, ...]:
@@ -208,6 +208,8 @@ class BenchSchema(Settings):
     def _require_objects(self) -> None:
         x_from, x_to, y_from, y_to = self.area
         for name, thing in self.objects.items():
+            if isinstance(thing, Box) and len(set(thing.size)) > 1:
+                raise SetupError(f"objects.{name}.size = {thing.size}; allowed: a cube")
             if thing.area is None:
                 continue
             x_low, x_high, y_low, y_high = thing.area

@@ -68,6 +68,28 @@ def test_a_plan_goes_on_after_its_program_was_killed(lab):
     )
 
 
+def test_copies_of_the_station_carry_out_trials_beside_it(lab):
+    child = subprocess.Popen(
+        [
+            *(sys.executable, "manage.py", "evaluate", PLAN),
+            *("--station", STATION, "--copies", "2", "--trials", "2"),
+        ],
+        cwd=ROOT,
+        env=lab.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    code, out, err = finished(child)
+    assert code == 0, err
+    assert "pick-place" not in out
+    rows = lab.rows("SELECT status, attempt, worker IS NOT NULL, episode_id IS NOT NULL FROM trials_trial")
+    assert rows == [("scored", 1, 1, 1)] * 2
+    assert not list((lab.data / "farm" / "trials").iterdir())
+    recorded = {path.name for path in (lab.data / "episodes").iterdir() if not path.name.startswith(".")}
+    assert len(recorded) == 2
+
+
 def test_what_cannot_be_carried_out_is_said(lab):
     code, _, err = finished(evaluating(lab, plan="moon"))
     assert code != 0

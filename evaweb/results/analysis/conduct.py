@@ -49,7 +49,7 @@ class AttemptRecord:
 
     `match` is the smallest agreement of a camera's image with its reference at the last bench check before the run;
     `override` is the reason for which a low match was accepted. `worker` is the copy of a simulated station that ran
-    it, "" for a trial of a person: nobody checks cameras of a copy, and copies run at the same time.
+    it, None for a trial of a person: nobody checks cameras of a copy, and copies run at the same time.
     """
 
     number: int
@@ -73,7 +73,7 @@ class AttemptRecord:
     connect: float | None
     warm_up: float | None
     latency: float | None
-    worker: str = ""
+    worker: str | None = None
     ended: str = ""
 
     @property

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.benches.schema import BenchSchema, Box, Disc, load_schema
+from runtime.benches.schema import BenchSchema, Disc, load_schema
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64
 from runtime.simulation.bench.arm_frames import arm_frames
@@ -73,9 +73,6 @@ class Bench:
 
     Blocks are the schema's boxes; further blocks are distractors, which are like the first box. `area` bounds the
     places of objects: lowest x, highest x, lowest y, highest y.
-
-    Raises:
-        BenchError: If a box is no cube.
     """
 
     def __init__(self, schema: BenchSchema = TABLETOP, belt: Belt | None = None) -> None:
@@ -84,7 +81,7 @@ class Bench:
         self.table_colour = _colour(schema.table_colour)
         self.block_names = tuple(schema.boxes)
         self.discs = tuple(_disc_shape(name, disc) for name, disc in schema.discs.items())
-        self._edges = tuple(_edge(name, box) for name, box in schema.boxes.items())
+        self._edges = tuple(box.size[0] for box in schema.boxes.values())
         self._colours = tuple(_colour(box.colour) for box in schema.boxes.values())
 
     @property
@@ -118,12 +115,6 @@ def _turn(colour: Colour, hue: float) -> Colour:
     return _colour(
         [round(255 * part) for part in colorsys.hsv_to_rgb((at + hue / 360) % 1.0, saturation, value)]
     )
-
-
-def _edge(name: str, box: Box) -> float:
-    if len(set(box.size)) > 1:
-        raise BenchError(f"objects.{name}.size = {box.size}; allowed on a simulated bench: a cube")
-    return box.size[0]
 
 
 def _disc_shape(name: str, disc: Disc) -> DiscShape:

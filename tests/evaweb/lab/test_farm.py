@@ -170,7 +170,7 @@ def test_a_person_is_not_disturbed_and_does_not_disturb(bench, monkeypatch):
     Processes(monkeypatch)
     carry_out(bench, plan, 1, most=1)
     by_hand.refresh_from_db()
-    assert (by_hand.status, by_hand.worker) == ("prepared", "")
+    assert (by_hand.status, by_hand.worker) == ("prepared", None)
     bench.event("state", "a -> b: restarted", state="idle")
     assert set(Trial.objects.exclude(pk=by_hand.pk).values_list("status", flat=True)) == {"scored"}
 

@@ -18,6 +18,7 @@ from evaweb.results.presentation.integrity import integrity_document
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
 from evaweb.trials.models import Checkpoint, Milestone, Scene, Trial
+from runtime.benches.schema import FILE, FOLDER, load_schema
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import without_triggers
 
@@ -212,6 +213,28 @@ def test_a_plan_for_some_stations_is_not_carried_out_on_others(bench, draft, own
     draft.stations.set([other])
     plan = freeze_plan(user=owner, plan=draft)
     with pytest.raises(Conflict, match="is for bench-2, not for bench-1"):
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
+
+
+def test_another_bench_of_the_scene_stops_the_plan(bench, plan, draft, owner, tmp_path):
+    Scene.objects.update(bench="sorting")
+    with pytest.raises(Conflict, match=r"bench was None, is 'sorting'"):
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
+
+
+def test_the_content_of_a_bench_of_ones_own_belongs_to_the_plan(bench, draft, owner, tmp_path):
+    for number, radius in ((1, "0.075"), (2, "0.08")):
+        (tmp_path / f"bench{number}").mkdir()
+        text = (FOLDER / "tabletop" / FILE).read_text().replace("radius = 0.075", f"radius = {radius}")
+        (tmp_path / f"bench{number}" / FILE).write_text(text)
+    own = tmp_path / "bench"
+    own.symlink_to(tmp_path / "bench1")
+    Scene.objects.update(bench=str(own))
+    plan = freeze_plan(user=owner, plan=draft)
+    load_schema.cache_clear()
+    own.unlink()
+    own.symlink_to(tmp_path / "bench2")
+    with pytest.raises(Conflict, match="bench_digest was 'sha256:"):
         allocate_trial(user=bench.operator, station=bench.station, plan=plan)
 
 

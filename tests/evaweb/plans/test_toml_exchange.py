@@ -8,7 +8,7 @@ from evaweb.plans.frozen_document import document_of
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan
 from evaweb.plans.toml_exchange import export_toml, import_file
-from evaweb.trials.models import Checkpoint, Milestone, Scene
+from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 from tests.evaweb.trials import builders
 
 KEY = bytes(32)
@@ -32,6 +32,15 @@ def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
         "plan blocks: draft changed",
     ]
     assert document_of(Plan.objects.get(pk=draft.pk), KEY) == before
+
+
+def test_factors_travel_as_well(draft, admin):
+    Position.objects.filter(number=1).update(bench={"block": [0.1, 0.3, 0], "factors": {"light": 0.5}})
+    text = export_toml(plans=[draft])
+    draft.delete()
+    Scene.objects.all().delete()
+    import_file(user=admin, text=text)
+    assert Position.objects.get(number=1).bench == {"block": [0.1, 0.3, 0], "factors": {"light": 0.5}}
 
 
 def test_another_lab_reads_it(draft, admin):

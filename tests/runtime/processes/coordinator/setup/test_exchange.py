@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from runtime.benches.schema import load_schema
 from runtime.config import loader
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.ipc.session_state import SessionState
@@ -328,8 +329,12 @@ def test_a_layout_has_to_fit_the_bench_of_the_transport(tmp_path: Path) -> None:
         SetupError, match="laid out for the simulated bench 'tabletop'; this station has 'sorting'"
     ):
         station.command("setup", bench={"seed": 2, "of": "tabletop"})
-    station.prepare(bench={"seed": 3, "of": "sorting"})
-    assert "of" not in station.robot.told[-1][1]  # it is not the node's
+    other, own = load_schema("tabletop").digest, load_schema("sorting").digest
+    for named, said in (("tabletop", "has 'sorting'$"), ("sorting", "whose bench.toml is another one")):
+        with pytest.raises(SetupError, match=said):
+            station.command("setup", bench={"seed": 2, "of": named, "schema_digest": other})
+    station.prepare(bench={"seed": 3, "of": "/a/copy/of/it", "schema_digest": own})
+    assert not {"of", "schema_digest"} & station.robot.told[-1][1].keys()  # they are not the node's
     station.close()
 
 
