@@ -44,6 +44,7 @@ KINDS = {
     "preflight": "Preflight",
     "scrub": "Verification of recordings",
     "reconcile": "Reading the disk",
+    "copies": "Trials without people",
     "diagnose": "Diagnostic bundle",
 }
 _ACTS = {"cancel": "cancelled", "repeat": "asked for again"}

@@ -13,8 +13,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evaweb.core.errors import EvaError
-from evaweb.lab import demo_rows, farm, lifetime, programs
+from evaweb.lab import demo_rows, lifetime, programs
 from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec
+from evaweb.plans import copies
 from evaweb.trials.models import Checkpoint
 
 SKILLED, CLUMSY = "pick-place-40k", "pick-place-8k"
@@ -82,8 +83,8 @@ class Benches:
             line = shlex.join(programs.serving(name, robot, self.skill(policy)))
             servers[url] = {"line": line, "delay_ms": POLICIES[policy].latency_ms}
         first = [f"policy.url={json.dumps(url)}" for url in [*urls.values()][:1]]
-        farm.write_copies(
-            station, farm.Copies(str(deployment), [*first, *assignments], self.options, servers)
+        copies.write_copies(
+            station, copies.Copies(str(deployment), [*first, *assignments], self.options, servers)
         )
 
     def server(self, policy: str) -> tuple[str, ...]:

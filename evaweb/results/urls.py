@@ -34,6 +34,6 @@ urlpatterns = [
     path(_PLAN + "trials/", views.trials, name="result-plan-trials"),
     *(
         path(f"{_PLAN}{what}", views.plan_action, {"what": what}, name=f"result-{what}")
-        for what in ("freeze", "amend", "close", "reveal", "look", "judge")
+        for what in ("freeze", "amend", "close", "reveal", "look", "judge", "carry-out", "pause")
     ),
 ]

@@ -17,7 +17,9 @@ from django.views.decorators.http import require_GET, require_POST
 from evaweb.accounts.roles import Role, role_of
 from evaweb.blinding.visibility import visibility_for_request
 from evaweb.core.errors import EvaError
-from evaweb.plans import services
+from evaweb.jobs.models import JobStatus
+from evaweb.jobs.selectors import pace_of
+from evaweb.plans import copies, services
 from evaweb.plans.blinding_rules import can_unblind, record_unblinding
 from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import compared
@@ -39,12 +41,14 @@ from evaweb.results.ratings.result_visibility import (
 )
 from evaweb.results.reports.reporting import write_report
 from evaweb.serving.lists import Listing
+from evaweb.stations.selectors import station_get
 from evaweb.trials.models import Trial
 from evaweb.trials.voids import open_void_requests
 
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
 MOST_LINES = 200  # lines per list on the integrity page; REST and the report have all
+_MOST_COPIES = 64
 _FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
 MOST_PICTURES = (
     32_000_000  # [bytes] of images in a report that is packed in memory; the command has no such limit
@@ -233,6 +237,8 @@ def plan_action(request: HttpRequest, name: str, version: int, what: str) -> Htt
         "close": lambda: services.close_plan(user=user, plan=plan, reason=reason),
         "reveal": lambda: services.reveal_plan(user=user, plan=plan),
         "look": lambda: record_unblinding(plan, user),
+        "carry-out": lambda: _carry_out(request, plan),
+        "pause": lambda: copies.pause_trials(user=user, plan=plan),
         "judge": lambda: request_judging(user=user, plan=plan, name=request.POST.get("judge", "")),
     }
     try:
@@ -241,6 +247,31 @@ def plan_action(request: HttpRequest, name: str, version: int, what: str) -> Htt
         return _plan_page(request, plan, fault, typed=reason)
     target = result if isinstance(result, Plan) else plan
     return redirect("result-plan", name=target.name, version=target.version)
+
+
+def _carry_out(request: HttpRequest, plan: Plan) -> object:
+    """Start the trials of a plan at copies of a simulated station."""
+    typed = request.POST.get("count", "")
+    if not typed.isascii() or not typed.isdecimal() or not 1 <= int(typed[:4]) <= _MOST_COPIES:
+        raise EvaError(f"copies = {typed!r:.40}; allowed: 1 to {_MOST_COPIES}")
+    station = station_get(name=request.POST.get("station", ""))
+    user: Any = request.user
+    return copies.request_trials(user=user, plan=plan, station=station, count=int(typed))
+
+
+def _copies(request: HttpRequest, plan: Plan) -> dict[str, Any] | None:
+    """Return the state of trials at copies of a station; None if none can be carried out by this user."""
+    stations = copies.stations_with_copies(plan) if plan.state == PlanState.FROZEN else []
+    if not stations or role_of(request.user) is Role.VIEWER:
+        return None
+    job = copies.job_of(plan)
+    return {
+        "stations": stations,
+        "at_work": copies.is_at_work(job),
+        "job": job,
+        "failed": job is not None and job.status == JobStatus.FAILED and job.cancelled_by_id is None,
+        "left_s": pace_of(job).left_s if job else None,
+    }
 
 
 def _citation_page(request: HttpRequest, cited: Citation) -> HttpResponse:
@@ -327,6 +358,7 @@ def _common(request: HttpRequest, plan: Plan) -> dict[str, Any]:
         "voids": open_void_requests(Trial.objects.filter(handout__plan=plan)),
         "judges_ready": judges_ready() if managed and has_results(plan) else [],
         "planned": planned_facts(plan),
+        "copies": _copies(request, plan),
         "here": "plans",
         "home": reverse("result-plan", args=[plan.name, plan.version]),
     }

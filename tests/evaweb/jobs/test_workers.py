@@ -45,6 +45,7 @@ def test_a_job_goes_into_the_queue_of_its_kind_which_is_one_that_workers_take() 
     assert {name: kind.queue for name, kind in kinds._kinds.items() if kind.queue != Queue.CPU} == {
         "judge": "gpu",
         "preflight": "station",
+        "copies": "station",
     }
     assert kinds.without_folder() == ["preflight"]
     assert enqueue("preflight").queue == "station"

@@ -17,9 +17,10 @@ from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError
 
 from evaweb.core.errors import EvaError
-from evaweb.lab import farm, plan_runner
+from evaweb.lab import plan_runner
 from evaweb.lab.progress import on_terminal
 from evaweb.lab.rest_client import RestClient
+from evaweb.plans import copies
 from evaweb.plans.selectors import plan_get
 from evaweb.stations.selectors import station_get
 
@@ -81,7 +82,7 @@ class Command(BaseCommand):
         if user is None:
             raise CommandError(f"--as {options['user']}: there is no such account; allowed: an operator's")
         plan = plan_get(name=options["plan"], user=user)
-        farm.carry_out(
+        copies.carry_out(
             user=user,
             plan=plan,
             station=station_get(name=options["station"]),
@@ -89,7 +90,7 @@ class Command(BaseCommand):
             most=options["trials"],
             tell=self.stdout.write,
         )
-        return farm.trials_left(plan)
+        return copies.trials_left(plan)
 
     def _at_station(self, options: dict[str, Any]) -> int:
         """Carry out trials at the station itself, over REST; return how many are left."""

@@ -29,9 +29,13 @@ from django.conf import settings
 from django.contrib.auth.models import User
 from django.db import close_old_connections, connection
 
+from evaweb.accounts.roles import Role, require_role
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.core.lock_wait import retry_while_locked
 from evaweb.episodes.folders import episodes_dir
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.selectors import job_newest
+from evaweb.jobs.services import cancel, enqueue
 from evaweb.plans.allocation import allocate_trial, plan_progress
 from evaweb.plans.counting import fails_by
 from evaweb.plans.design import dropped_of, findings_of
@@ -48,6 +52,7 @@ from runtime.benches.schema import UnusableBench
 from runtime.core.environment import without_web_secrets
 
 FOLDER = "farm"  # below the data folder
+JOB = "copies"
 _MOST_ATTEMPTS = 3  # of one trial whose run is interrupted
 _LOOK_S = 1.0  # longest wait until a copy looks again whether it is its trial's turn
 _DISMISSED = "the plan's design had ended, or dropped its checkpoint, when it was its turn"
@@ -125,15 +130,7 @@ def carry_out(*, user: User, plan: Plan, station: Station, count: int, most: int
     Raises:
         EvaError: If a trial cannot be carried out. Trials that other copies have begun are finished first.
     """
-    copies = copies_of(station)
-    if count < 1:
-        raise EvaError(f"{count} copies; allowed: 1 or more")
-    _require_reports(plan)
-    if plan.match_gate is not None:
-        raise EvaError(
-            f"{plan} wants a person to compare the bench with a reference picture (least match {plan.match_gate:g}); "
-            "allowed: a plan without one"
-        )
+    copies = _check(plan, station, count)
     with _alone(station), ThreadPoolExecutor(count, "copy") as pool:
         run = _Run(user, plan, station, copies, most, tell)
         work = [
@@ -145,6 +142,20 @@ def carry_out(*, user: User, plan: Plan, station: Station, count: int, most: int
         except BaseException:
             run.stop()
             raise
+
+
+def _check(plan: Plan, station: Station, count: int) -> Copies:
+    """Return how copies of the station are started. Raises: EvaError if the plan cannot be carried out at them."""
+    copies = copies_of(station)
+    if count < 1:
+        raise EvaError(f"{count} copies; allowed: 1 or more")
+    _require_reports(plan)
+    if plan.match_gate is not None:
+        raise EvaError(
+            f"{plan} wants a person to compare the bench with a reference picture (least match {plan.match_gate:g}); "
+            "allowed: a plan without one"
+        )
+    return copies
 
 
 def _require_reports(plan: Plan) -> None:
@@ -164,6 +175,75 @@ def _require_reports(plan: Plan) -> None:
                     f"milestone {milestone.text!r} of scene {scene.name} is {milestone.truth!r} in the bench's truth, "
                     f"and nobody scores it here; allowed: {', '.join(reports)}"
                 )
+
+
+def request_trials(*, user: User, plan: Plan, station: Station, count: int) -> Job:
+    """Queue the job that carries out the plan's trials at `count` copies of a station, until none is left.
+
+    Raises:
+        EvaError: If a trial of the plan could not be carried out so.
+    """
+    require_role(user, Role.OPERATOR)
+    _check(plan, station, count)
+    if plan.state != PlanState.FROZEN:
+        raise Conflict(f"{plan} is {plan.get_state_display()}: only trials of a running plan are carried out")
+    if is_at_work(job_newest(key=_key(plan))):
+        raise Conflict(f"trials of {plan} are carried out already: pause that first")
+    args = {"plan": plan.pk, "station": station.pk, "user": user.pk, "count": count}
+    return enqueue(kind=JOB, key=_key(plan), args=args)
+
+
+def pause_trials(*, user: User, plan: Plan) -> Job:
+    """Let no further trial begin; those at work are finished. Raises: Conflict if none is carried out."""
+    require_role(user, Role.OPERATOR)
+    job = job_newest(key=_key(plan))
+    if job is None or not is_at_work(job):
+        raise Conflict(f"no trial of {plan} is carried out at copies: there is nothing to pause")
+    return cancel(user=user, job=job)
+
+
+def job_of(plan: Plan) -> Job | None:
+    """Return the newest job that carries out trials of the plan, None if there is none."""
+    return job_newest(key=_key(plan))
+
+
+def is_at_work(job: Job | None) -> bool:
+    """Return True while trials are carried out, or are about to be."""
+    return (
+        job is not None
+        and job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
+        and job.cancelled_by_id is None
+    )
+
+
+def stations_with_copies(plan: Plan) -> list[Station]:
+    """Return the stations at whose copies trials of the plan can be carried out."""
+    started = [file.stem for file in _folder().glob("*.json")]
+    if not started:
+        return []
+    rows = Station.objects.filter(simulated=True, active=True, name__in=started)
+    return list(rows.filter(pk__in=plan.stations.all()) if plan.stations.exists() else rows)
+
+
+def carry_out_some(args: Mapping[str, Any], report: Tell) -> dict[str, int]:
+    """Carry out two trials per copy, and queue the job again if more are left, so that other jobs get their turn."""
+    plan, user = Plan.objects.get(pk=args["plan"]), User.objects.get(pk=args["user"])
+    station, count = Station.objects.get(pk=args["station"]), int(args["count"])
+
+    def on_line(line: str) -> None:
+        progress = plan_progress(plan)
+        report(f"trial {min(progress.counted + 1, progress.total)} of {progress.total}")
+
+    on_line("")
+    made = carry_out(user=user, plan=plan, station=station, count=count, most=2 * count, tell=on_line)
+    left = trials_left(plan)
+    if made and left:
+        enqueue(kind=JOB, key=_key(plan), args=args)
+    return {"made": made, "left": left}
+
+
+def _key(plan: Plan) -> str:
+    return f"{JOB}:{plan.pk}"
 
 
 def trials_left(plan: Plan) -> int:

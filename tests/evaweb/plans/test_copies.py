@@ -9,7 +9,9 @@ from uuid import uuid4
 import pytest
 
 from evaweb.core.errors import Conflict, EvaError
-from evaweb.lab import farm
+from evaweb.jobs.kinds import JobContext, kind_named
+from evaweb.jobs.models import Job
+from evaweb.plans import copies as farm
 from evaweb.plans.allocation import plan_progress
 from evaweb.plans.design import findings_of
 from evaweb.plans.models import Plan
@@ -221,3 +223,74 @@ def test_two_programs_do_not_share_the_copies_of_a_station(bench, monkeypatch):
 
     Processes(monkeypatch, meanwhile)
     carry_out(bench, plan, 1, most=1)
+
+
+# --- as a job, from the plan's page ---------------------------------------------------------------------------
+
+
+def page(client, plan):
+    return client.get(f"/result/plans/{plan.name}/{plan.version}/").content.decode()
+
+
+def press(client, plan, what, **fields):
+    return client.post(
+        f"/result/plans/{plan.name}/{plan.version}/{what}", fields, follow=True
+    ).content.decode()
+
+
+def worked_off():
+    """Do what a worker does, until nothing waits."""
+    reports = []
+    while (job := Job.objects.filter(status="queued").order_by("pk").first()) is not None:
+        job.status = "running"
+        job.save()
+        kind_named(job.kind)(JobContext(job.args, reports.append))
+        Job.objects.filter(pk=job.pk).update(status="done")
+    return reports
+
+
+def test_an_operator_starts_and_pauses_it_on_the_page_of_the_plan(bench, client, monkeypatch):
+    plan = plan_of(bench)
+    Processes(monkeypatch)
+    client.force_login(bench.operator)
+    assert "Carry out the trials" in page(client, plan)
+    assert "Pause: begin no further trial" in press(client, plan, "carry-out", station="bench-1", count="2")
+    assert "are carried out already: pause that first" in press(
+        client, plan, "carry-out", station="bench-1", count="2"
+    )
+    assert "Carry out the trials" in press(client, plan, "pause")
+    assert not Trial.objects.exists()
+    press(client, plan, "carry-out", station="bench-1", count="2")
+    reports = worked_off()
+    assert Job.objects.filter(kind="copies", status="done").count() == 2, "two trials per copy and job"
+    assert set(Trial.objects.values_list("status", "operator__username")) == {("scored", "ann")}
+    assert farm.trials_left(plan) == 0
+    assert reports[0] == "trial 1 of 8"
+    assert not any(name in report for report in reports for name in (WINS, bench.checkpoint.name))
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"station": "bench-1", "count": "0"}, "copies = &#x27;0&#x27;; allowed: 1 to 64"),
+        ({"station": "bench-1", "count": "65"}, "allowed: 1 to 64"),
+        ({"station": "bench-1", "count": "many"}, "allowed: 1 to 64"),
+        ({"station": "bench-9", "count": "1"}, "bench-9"),
+    ],
+)
+def test_what_cannot_be_started_is_said_on_the_page(bench, client, fields, why):
+    plan = plan_of(bench)
+    client.force_login(bench.operator)
+    assert why in press(client, plan, "carry-out", **fields)
+    assert not Job.objects.exists()
+
+
+def test_nobody_is_offered_what_is_not_theirs_or_not_there(bench, client):
+    plan = plan_of(bench)
+    client.force_login(builders.user("vera", "viewer"))
+    assert "Carry out the trials" not in page(client, plan)
+    press(client, plan, "carry-out", station="bench-1", count="1")
+    assert not Job.objects.exists()
+    farm._file_of(bench.station.name).unlink()
+    client.force_login(bench.operator)
+    assert "Carry out the trials" not in page(client, plan)
