@@ -253,5 +253,7 @@ EVA_COMMAND_TIMEOUT_S = environment.read_seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
 EVA_JOB_STALE_S = environment.read_seconds("EVA_JOB_STALE_S", 60.0)
 # Time for which a stopping worker may finish its job [s]; then the job is requeued.
 EVA_WORKER_GRACE_S = environment.read_seconds("EVA_WORKER_GRACE_S", 12.0)
+# Number of copies of simulated stations that a worker runs at the same time.
+EVA_COPIES = environment.copies("EVA_COPIES", max(1, len(os.sched_getaffinity(0)) // 2))
 # Niceness of a worker's process.
 EVA_WORKER_NICE = environment.niceness("EVA_WORKER_NICE", 19)

@@ -29,6 +29,7 @@ from evaweb.api import (
     stations,
     statistics,
     subsets,
+    templates,
     trials,
 )
 from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
@@ -82,6 +83,7 @@ api.add_router("", reviews.router)
 api.add_router("/scenes", scenes.router)
 api.add_router("/failures", failures.router)
 api.add_router("/checkpoints", checkpoints.router)
+api.add_router("/templates", templates.router)
 api.add_router("/preflights", preflights.router)
 api.add_router("", sessions.router)
 api.add_router("", results.router)

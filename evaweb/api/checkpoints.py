@@ -26,6 +26,7 @@ class CheckpointOut(Schema):
     parent: str | None
     recipe: str
     training_set: str | None
+    training_run: str | None
     tags: list[str]
     strategy: dict[str, Any] | None
     anchor: bool

@@ -17,7 +17,7 @@ from evaweb.api.responses import (
 )
 from evaweb.api.trials import TrialDetail
 from evaweb.blinding.visibility import visibility_for_request
-from evaweb.plans import allocation, services
+from evaweb.plans import allocation, copies, services
 from evaweb.plans import bench_checks as bench
 from evaweb.plans.allocation import plan_progress
 from evaweb.plans.blinding_rules import is_sealed_for, record_unblinding
@@ -98,6 +98,30 @@ class StationIn(Body):
     """Station that runs the trial."""
 
     station: str
+
+
+class CopiesIn(Body):
+    """Simulated station, and how many of its copies run trials at the same time."""
+
+    station: Annotated[str, Field(max_length=63)]
+    count: Annotated[int, Field(ge=1, le=copies.MOST_COPIES, strict=True)] = 1
+
+
+class CopiesOut(Schema):
+    """How trials are carried out at copies: of `copies`, `running` run a trial.
+
+    `left_s` is the time until all trials are scored [s]. `lacks` is why no worker runs them. `ended` is why the last
+    copies ended before the plan; if it may name what is hidden from the caller, it is empty and `hidden` is true.
+    """
+
+    copies: int
+    running: int
+    lacks: str
+    counted: int
+    total: int
+    left_s: float | None
+    ended: str
+    hidden: bool
 
 
 class ReleaseSlotsIn(Body):
@@ -281,6 +305,43 @@ def release_slots(request: HttpRequest, name: str, given: ReleaseSlotsIn) -> Any
     return {
         "freed": allocation.release_slots(user=request.auth, plan=plan, station=station, reason=given.reason)
     }
+
+
+@router.get(
+    "/plans/{name}/copies",
+    response={200: CopiesOut, **FAILURES},
+    summary="Trials without people",
+    url_name="plan-copies",
+)
+def copies_state(request: HttpRequest, name: str) -> Any:
+    """Return how trials of the plan are carried out at copies of a simulated station."""
+    return copies.copies_state(plan_get(name=name, user=request.auth), visibility_for_request(request))
+
+
+@router.post(
+    "/plans/{name}/copies",
+    response={202: CopiesOut, **FAILURES},
+    summary="Carry out trials without people",
+    url_name="plan-copies",
+)
+def carry_out(request: HttpRequest, name: str, given: CopiesIn) -> Any:
+    """Carry out the plan's trials at copies of a simulated station, until none is left. Requires an operator."""
+    plan, station = plan_get(name=name, user=request.auth), station_get(name=given.station)
+    copies.request_trials(user=request.auth, plan=plan, station=station, count=given.count)
+    return Status(202, copies.copies_state(plan, visibility_for_request(request)))
+
+
+@router.delete(
+    "/plans/{name}/copies",
+    response={200: CopiesOut, **FAILURES},
+    summary="Pause trials without people",
+    url_name="plan-copies",
+)
+def pause(request: HttpRequest, name: str) -> Any:
+    """Begin no further trial at copies; those at work are finished. Requires an operator."""
+    plan = plan_get(name=name, user=request.auth)
+    copies.pause_trials(user=request.auth, plan=plan)
+    return copies.copies_state(plan, visibility_for_request(request))
 
 
 @router.post(

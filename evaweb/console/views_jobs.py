@@ -20,6 +20,7 @@ from evaweb.core.printed_names import is_name
 from evaweb.datasets import dataset_jobs
 from evaweb.datasets.dataset_orders import KIND as DATASET
 from evaweb.jobs import services
+from evaweb.jobs.kinds import starts_elsewhere
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import Pace, job_get, jobs_listed, pace_of
 from evaweb.jobs.workers import Served, served
@@ -45,6 +46,7 @@ KINDS = {
     "scrub": "Verification of recordings",
     "reconcile": "Reading the disk",
     "copies": "Trials without people",
+    "template": "Plan of a new checkpoint",
     "diagnose": "Diagnostic bundle",
 }
 _ACTS = {"cancel": "cancelled", "repeat": "asked for again"}
@@ -71,7 +73,7 @@ class Row:
     @property
     def may_repeat(self) -> bool:
         """True if the job has failed."""
-        return self.job.status == JobStatus.FAILED
+        return self.job.status == JobStatus.FAILED and not starts_elsewhere(self.job.kind)
 
     @property
     def minutes_left(self) -> str:

@@ -105,11 +105,20 @@ def archive_days(name: str, stored: bool) -> float | None:
 
 def niceness(name: str, default: int) -> int:
     """Return the process niceness in the environment variable `name`: from 0 (normal priority) to 19 (lowest)."""
+    return _whole(name, default, 19)
+
+
+def copies(name: str, default: int) -> int:
+    """Return the number of copies in the environment variable `name`: from 0 to 1000."""
+    return _whole(name, default, 1000)
+
+
+def _whole(name: str, default: int, most: int) -> int:
     text = os.environ.get(name)
     if text is None:
         return default
-    if not (text.isascii() and text.isdecimal() and int(text) <= 19):
-        raise ImproperlyConfigured(f"{name} = {text!r}; allowed: 0 to 19")
+    if not (text.isascii() and text.isdecimal() and int(text) <= most):
+        raise ImproperlyConfigured(f"{name} = {text!r}; allowed: 0 to {most}")
     return int(text)
 
 

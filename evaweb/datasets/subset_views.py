@@ -14,7 +14,7 @@ from evaweb.blinding.visibility import visibility_for_request
 from evaweb.core.errors import EvaError
 from evaweb.datasets.views import rights_context, work_context
 from evaweb.episodes import listed
-from evaweb.episodes.subsets import create_subset, subset_list
+from evaweb.episodes.subsets import create_subset, remove_subset, subset_get, subset_list
 from evaweb.serving.lists import Listing
 
 
@@ -28,6 +28,18 @@ def subsets(request: HttpRequest) -> HttpResponseBase:
     ]
     context = {"rows": rows, "name": "", **work_context(""), **rights_context(request)}
     return render(request, "datasets/subsets.html", context)
+
+
+@require_POST
+def remove(request: HttpRequest) -> HttpResponseBase:
+    """Remove the subset that the form names."""
+    try:
+        subset = subset_get(name=request.POST.get("name", ""))
+        remove_subset(user=request.user, subset=subset)
+        messages.success(request, f"{subset.name}: removed")
+    except EvaError as error:
+        messages.error(request, str(error))
+    return redirect("subset-list")
 
 
 @require_POST

@@ -15,6 +15,7 @@ urlpatterns = [
     path("replay/datasets/-/bags", bag_views.bag_list, name="bag-list"),
     path("replay/datasets/-/mapping", bag_views.bag_mapping, name="bag-mapping"),
     path("replay/subsets/", subset_views.subsets, name="subset-list"),
+    path("replay/subsets/remove", subset_views.remove, name="subset-remove"),
     path("replay/subsets/save", subset_views.save_subset, name="subset-save"),
     path("replay/side-by-side/", replay_views.side_by_side, name="side-by-side"),
     path("replay/on-robot/", replay_views.on_robot, name="on-robot"),

@@ -16,6 +16,7 @@ from evaweb.blinding.visibility import Visibility
 from evaweb.core.errors import Conflict, EvaError, NotFound
 from evaweb.episodes.models import Episode, Subset
 from evaweb.episodes.selectors import episode_list
+from evaweb.jobs.models import Job, JobStatus
 from runtime.core.sentences import Pattern, fixed
 
 _THERE_ALREADY = Pattern(
@@ -27,6 +28,10 @@ _NONE_FOUND = fixed(
 )
 _SEVERAL_ROBOTS = Pattern(
     "episodes.subsets.several_robots", "the episodes are of {count} robots ({names}); allowed: of one"
+)
+_IN_USE = Pattern(
+    "episodes.subsets.in_use",
+    "{name} was published, or is stated at a checkpoint: it stays, so that one can say later what was trained on",
 )
 _NO_SUBSET = Pattern("episodes.subsets.no_subset", "there is no subset {name!r:.120}; there are: {there}")
 _NAME = Pattern("episodes.subsets.name", "name: {why}")
@@ -80,6 +85,21 @@ def create_subset(
     return subset
 
 
+@transaction.atomic
+def remove_subset(*, user: Any, subset: Subset) -> None:
+    """Remove a subset. Raises: Conflict if it was published, or a checkpoint was trained on it."""
+    require_role(user, Role.OPERATOR)
+    locked = Subset.objects.select_for_update().get(pk=subset.pk)
+    if locked.dataset or locked.checkpoints.exists() or _is_being_published(locked):
+        raise Conflict(_IN_USE(name=locked.name))
+    locked.delete()
+
+
+def _is_being_published(subset: Subset) -> bool:
+    active = Job.objects.filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING), args__subset=subset.name)
+    return active.exists()
+
+
 def _publishable(query: Mapping[str, str], sight: Visibility, chosen: Sequence[str]) -> Any:
     rows = episode_list(**query, sight=sight).exclude(dataset_index=None)
     if not chosen:
@@ -105,11 +125,16 @@ def subset_get(*, name: str) -> Subset:
 
 
 def subset_list(*, sight: Visibility) -> list[Subset]:
-    """Return the subsets, newest first, with the number of their episodes as `n_episodes`.
+    """Return the subsets, newest first.
+
+    Attribute `n_episodes` is the number of their episodes, `trained_on` that of the checkpoints that were trained on
+    them.
 
     Left out are those whose name, description or query names a hidden checkpoint.
     """
-    rows = Subset.objects.select_related("created_by").annotate(n_episodes=Count("episodes"))
+    rows = Subset.objects.select_related("created_by").annotate(
+        n_episodes=Count("episodes", distinct=True), trained_on=Count("checkpoints", distinct=True)
+    )
     rows = rows.order_by("-created_at", "-pk")
     return [row for row in rows if not _names_hidden(row, sight)]
 

@@ -7,6 +7,7 @@ from django.db.models import QuerySet
 from django.http import HttpRequest
 
 from evaweb.jobs import services
+from evaweb.jobs.kinds import starts_elsewhere
 from evaweb.jobs.models import Job, JobStatus
 
 
@@ -31,7 +32,7 @@ class JobAdmin(admin.ModelAdmin):
 
     @admin.action(description="Try failed jobs again", permissions=("view",))
     def try_again(self, request: HttpRequest, jobs: QuerySet) -> None:
-        failed = list(jobs.filter(status=JobStatus.FAILED))
+        failed = [job for job in jobs.filter(status=JobStatus.FAILED) if not starts_elsewhere(job.kind)]
         for job in failed:
             services.retry_job(user=request.user, job=job)
         self.message_user(request, f"{len(failed)} asked for anew", messages.SUCCESS)

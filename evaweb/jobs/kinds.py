@@ -19,6 +19,7 @@ class Queue(StrEnum):
     CPU = "cpu"  # CPU time, and a disk that is fast enough for recordings
     GPU = "gpu"  # an accelerator, or access to a server with one
     STATION = "station"  # the deployment files of this lab's stations, and access to their policy servers
+    COPIES = "copies"  # the same, and CPU time for trials at copies of simulated stations, several at the same time
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,7 @@ class Declared:
     least: Least = _operators
     queue: Queue = Queue.CPU
     folder: bool = True  # needs the lab's data folder
+    start: str = ""  # where people start it, if they may not have a failed job tried again
 
 
 _kinds: dict[str, Declared] = {}
@@ -68,12 +70,23 @@ class Cancelled(Exception):
     """Error that ends a job function after a user has cancelled the job."""
 
 
+class JobUnfinished(Exception):
+    """Ends a job's execution that has done a part of the work: the job is queued again, behind those that wait.
+
+    `after_s` is the time until then [s].
+    """
+
+    def __init__(self, after_s: float = 0.0) -> None:
+        super().__init__(f"to be continued after {after_s:g} s")
+        self.after_s = after_s
+
+
 class UnknownKind(EvaError):
     """Error if no app has declared jobs of that kind."""
 
 
 def job_kind(
-    name: str, least: Least = _operators, *, queue: Queue = Queue.CPU, folder: bool = True
+    name: str, least: Least = _operators, *, queue: Queue = Queue.CPU, folder: bool = True, start: str = ""
 ) -> Callable[[Kind], Kind]:
     """Declare a kind of jobs: decorate the function that does such a job and returns its result as JSON.
 
@@ -86,10 +99,11 @@ def job_kind(
         queue: Queue of workers that execute such jobs.
         folder: Whether such a job needs the lab's data folder, because it accesses recordings, datasets or records in
             place.
+        start: Where people start such a job anew; "" if they may have a failed one tried again as it is.
     """
 
     def declare(function: Kind) -> Kind:
-        _kinds[name] = Declared(function, least, queue, folder)
+        _kinds[name] = Declared(function, least, queue, folder, start)
         return function
 
     return declare
@@ -127,6 +141,11 @@ def declared(name: str) -> Declared:
             f"no job of kind {name!r} is known; there are {', '.join(sorted(_kinds)) or 'none'}"
         )
     return _kinds[name]
+
+
+def starts_elsewhere(name: str) -> bool:
+    """Return True if people may not have a failed job of that kind tried again, because they start it elsewhere."""
+    return name in _kinds and bool(_kinds[name].start)
 
 
 def kind_named(name: str) -> Kind:

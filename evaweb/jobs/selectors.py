@@ -9,7 +9,7 @@ from datetime import datetime
 from statistics import median
 
 from django.db.models import Case, Exists, IntegerField, OuterRef, Q, QuerySet, Value, When
-from django.db.models.functions import Now
+from django.db.models.functions import Coalesce, Now
 from django.utils import timezone
 
 from evaweb.core.errors import NotFound
@@ -23,19 +23,19 @@ _JOB_DOES_NOT_EXIST_THIS = Pattern(
 )
 
 
-def jobs_ready(*, queues: Collection[str], folder: bool = True) -> QuerySet[Job]:
+def jobs_ready(*, queues: Collection[str], folder: bool = True, keys: str = "") -> QuerySet[Job]:
     """Return the jobs that may be claimed, oldest first; a job waits while one with its key is running.
 
-    Without the lab's data `folder`, only kinds that do not need it.
+    Without the lab's data `folder`, only kinds that do not need it. `keys` is how the keys of these jobs begin.
     """
     same_running = Job.objects.filter(key=OuterRef("key"), status=JobStatus.RUNNING)
     return (
         Job.objects.filter(
             Q() if folder else Q(kind__in=without_folder()), status=JobStatus.QUEUED, queue__in=queues
         )
-        .filter(Q(not_before=None) | Q(not_before__lte=Now()))
+        .filter(Q(not_before=None) | Q(not_before__lte=Now()), key__startswith=keys)
         .exclude(Exists(same_running))
-        .order_by("created_at", "pk")
+        .order_by(Coalesce("not_before", "created_at"), "pk")
     )
 
 

@@ -27,7 +27,16 @@ from evaweb.core.errors import Conflict
 from evaweb.core.lock_wait import retry_while_locked
 from evaweb.jobs import doorbell
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
-from evaweb.jobs.kinds import Args, Cancelled, JobContext, JobTakenOver, declared, kind_named, least_role
+from evaweb.jobs.kinds import (
+    Args,
+    Cancelled,
+    JobContext,
+    JobTakenOver,
+    JobUnfinished,
+    declared,
+    kind_named,
+    least_role,
+)
 from evaweb.jobs.locks import ClaimantState, claimant_state, exclusive_job
 from evaweb.jobs.models import Hold, Job, JobStatus
 from evaweb.jobs.selectors import jobs_ready
@@ -38,6 +47,10 @@ log = logging.getLogger(__name__)
 _JOB_ONLY_ONE_FAILED_TRIED = Pattern(
     "jobs.services.job_only_one_failed_tried",
     "job {job} ({key}) is {status}: only one that failed is tried again",
+)
+_STARTED_ELSEWHERE = Pattern(
+    "jobs.services.started_elsewhere",
+    "job {job} ({key}) is not tried again as it was: start it anew {elsewhere}",
 )
 _JOB_THERE_NOTHING_CANCEL = Pattern(
     "jobs.services.job_there_nothing_cancel",
@@ -89,6 +102,8 @@ def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
 def retry_job(*, user: Any, job: Job) -> Job:
     """Queue a failed job again. Raises: Conflict unless it has failed; NotAllowed if the user may not request it."""
     require_role(user, least_role(job.kind, job.args))
+    if elsewhere := declared(job.kind).start:
+        raise Conflict(_STARTED_ELSEWHERE(job=job.pk, key=job.key, elsewhere=elsewhere))
     if job.status != JobStatus.FAILED:
         raise Conflict(_JOB_ONLY_ONE_FAILED_TRIED(job=job.pk, key=job.key, status=job.get_status_display()))
     return enqueue(kind=job.kind, key=job.key, args=job.args)
@@ -118,10 +133,13 @@ def _cancelled_words(user: Any) -> str:
 # --- working -------------------------------------------------------------------------------------------------
 
 
-def claim(*, queue: str, owner: UUID) -> Job | None:
-    """Claim the oldest ready job that this process can do; None if there is none. Of two workers only one gets it."""
+def claim(*, queue: str, owner: UUID, keys: str = "") -> Job | None:
+    """Claim the oldest ready job that this process can do; None if there is none. Of two workers only one gets it.
+
+    `keys` is how the keys of these jobs begin.
+    """
     folder = has_lab_folder()
-    while (ready := jobs_ready(queues=[queue], folder=folder).first()) is not None:
+    while (ready := jobs_ready(queues=[queue], folder=folder, keys=keys).first()) is not None:
         claimed = Job.objects.filter(pk=ready.pk, status=JobStatus.QUEUED).update(
             status=JobStatus.RUNNING,
             owner=owner,
@@ -143,13 +161,23 @@ def run_queue(queue: str) -> int:
     if not _busy.acquire(blocking=False):
         return 0
     try:
-        count = 0
-        while not _ending.is_set() and (job := retry_while_locked(partial(claim, queue=queue, owner=OWNER))):
-            _perform(job)
-            count += 1
-        return count
+        return work_off(queue)
     finally:
         _busy.release()
+
+
+def work_off(queue: str, keys: str = "") -> int:
+    """Execute the ready jobs of `queue` whose keys begin with `keys`, until none is left; return their number.
+
+    Several threads may do so at the same time.
+    """
+    count = 0
+    while not _ending.is_set() and (
+        job := retry_while_locked(partial(claim, queue=queue, owner=OWNER, keys=keys))
+    ):
+        _perform(job)
+        count += 1
+    return count
 
 
 def _perform(job: Job) -> None:
@@ -167,6 +195,8 @@ def _perform(job: Job) -> None:
             return
         except Cancelled:
             ended = partial(_ended_if_cancelled, row=_ours(job))
+        except JobUnfinished as rest:
+            ended = partial(job_unfinished, job=job, after_s=rest.after_s)
         except Exception as error:  # an exception fails the job, never the worker
             log.warning("job %s failed: %s", job.key, error, exc_info=True)
             ended = partial(job_failed, job=job, error=str(error) or type(error).__name__)
@@ -256,6 +286,12 @@ def job_failed(*, job: Job, error: str) -> bool:
         return _finish(job, status=JobStatus.FAILED, attempts=attempts, error=error)
     not_before = Now() + timedelta(seconds=RETRY_AFTER_S[attempts - 1])
     return _requeue_row(_ours(job), attempts=attempts, error=error, not_before=not_before)
+
+
+def job_unfinished(*, job: Job, after_s: float) -> bool:
+    """Queue the job again in `after_s` [s], unless it was cancelled: it has done a part of its work."""
+    facts = {"attempts": 0, "deaths": 0, "error": "", "not_before": Now() + timedelta(seconds=after_s)}
+    return _requeue_row(_ours(job), **facts)
 
 
 def job_postponed(*, job: Job) -> bool:

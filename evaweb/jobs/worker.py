@@ -1,4 +1,8 @@
-"""Worker process: celery notifies it of new jobs, and it polls every few seconds in case a notification was lost."""
+"""Worker process: celery notifies it of new jobs, and it polls every few seconds in case a notification was lost.
+
+Jobs are executed one at a time, except those of the queue `copies`: of these, EVA_COPIES are executed beside the
+others, because each mostly waits for a process of its own.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,7 @@ log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 3.0
 BROKER_AGAIN_S = 30.0
+_copies_wait = threading.Event()  # jobs of the queue `copies` may be ready
 
 
 def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
@@ -33,11 +38,15 @@ def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
     requeued, and this process exits.
     """
     os.nice(settings.EVA_WORKER_NICE)
+    if not settings.EVA_COPIES:
+        queues = [queue for queue in queues if queue != Queue.COPIES]
     ending = _ending_by_signal()
     if lifeline:
         threading.Thread(target=_watch_input, name="lifeline", daemon=True).start()
     looking = threading.Thread(target=_poll, args=(queues, ending), name="looking")
     looking.start()
+    for number in range(settings.EVA_COPIES * (Queue.COPIES in queues)):
+        threading.Thread(target=_work_on_copies, args=(ending,), name=f"copy-{number}", daemon=True).start()
     heartbeat = Heartbeat(
         partial(workers.record_heartbeat, owner=services.OWNER, queues=queues), settings.EVA_JOB_STALE_S / 6
     )
@@ -51,6 +60,7 @@ def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
                 )
                 ending.wait(BROKER_AGAIN_S)
         looking.join()
+    _attempt("trials at copies", partial(retry_while_locked, partial(services.requeue, owner=services.OWNER)))
     _attempt("leaving the list of workers", partial(workers.worker_ended, owner=services.OWNER))
     log.info("the worker has ended")
 
@@ -121,8 +131,24 @@ def _poll(queues: Sequence[str], ending: threading.Event) -> None:
                 _attempt(name, partial(retry_while_locked, task))
             begun = True
         for queue in queues:
-            _attempt(f"queue {queue}", partial(services.run_queue, queue))
+            if queue != Queue.COPIES:
+                _attempt(f"queue {queue}", partial(services.run_queue, queue))
         ending.wait(LOOK_EVERY_S)
+    connection.close()
+
+
+def wake_copies() -> None:
+    """Let the threads look for ready jobs of the queue `copies`."""
+    _copies_wait.set()
+
+
+def _work_on_copies(ending: threading.Event) -> None:
+    """Execute ready jobs of the queue `copies`; the end of this process ends them, and each is carried on elsewhere."""
+    while not ending.is_set():
+        close_old_connections()
+        _attempt("queue copies", partial(services.work_off, Queue.COPIES))
+        if _copies_wait.wait(LOOK_EVERY_S):
+            _copies_wait.clear()
     connection.close()
 
 

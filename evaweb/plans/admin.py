@@ -17,7 +17,7 @@ from django.utils.safestring import SafeString, mark_safe
 
 from evaweb.core.errors import EvaError
 from evaweb.plans.design import look_schedule
-from evaweb.plans.models import Plan, PlanEvent, PlanState
+from evaweb.plans.models import Plan, PlanEvent, PlanState, PlanTemplate, TemplateUse
 from evaweb.plans.references import LARGEST, unpacked
 from evaweb.plans.toml_exchange import export_archive, export_toml, import_file
 from evaweb.trials.admin import ReadOnly, Table
@@ -255,6 +255,39 @@ class PlanAdmin(admin.ModelAdmin):
         """Return the number of scheduled trials."""
         n = plan.slots.count() or plan.positions.count() * plan.checkpoints.count() * plan.repetitions
         return str(n)
+
+
+class UseInline(ReadOnly, admin.TabularInline):
+    """Table of the plans that a template has made."""
+
+    model = TemplateUse
+    extra = 0
+    fields = ("at", "checkpoint", "plan")
+    readonly_fields = fields
+
+
+class TemplateForm(forms.ModelForm):
+    """Form of a template."""
+
+    policy = Table(required=False, help_text=PlanTemplate._meta.get_field("policy").help_text)
+
+    class Meta:
+        model = PlanTemplate
+        fields = ("name", "title", "plan", "arm", "tag", "policy", "station", "copies", "active")
+
+    def clean_policy(self) -> dict[str, Any]:
+        """Return the policy's table; {} for an empty field: then everything is as in the deployment."""
+        return self.cleaned_data["policy"] or {}
+
+
+@admin.register(PlanTemplate)
+class PlanTemplateAdmin(admin.ModelAdmin):
+    """Admin page of templates."""
+
+    form = TemplateForm
+    list_display = ("name", "plan", "arm", "tag", "station", "active")
+    list_select_related = ("plan", "arm", "station")
+    inlines = (UseInline,)
 
 
 def _newest(rows: QuerySet[Plan]) -> list[Plan]:

@@ -15,6 +15,7 @@ class PlansConfig(AppConfig):
         from evaweb.plans import blinding_rules as sight  # noqa: F401
         from evaweb.plans import (
             counting,  # noqa: F401
+            plan_templates,  # noqa: F401
             services,  # noqa: F401
         )
         from evaweb.plans import setup_padding as pacing  # noqa: F401

@@ -1,8 +1,9 @@
 """Trials of a plan without people, at copies of a simulated station: a process per trial, several at the same time.
 
 Trials are handed out, kept blind and scored as for an operator. A copy exists for one trial, in lockstep, so that the
-result depends neither on the number of copies nor on what ran before. If this program is killed at any moment, its next
-start carries on with the trials that were handed out, whose results are the same.
+result depends neither on the number of copies nor on what ran before. Each copy is a job, which carries out a trial and
+is queued again; so copies can be at work on several machines. If a worker is killed at any moment, its trial is run
+again, with the same result.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -27,38 +29,68 @@ from uuid import uuid5
 
 from django.conf import settings
 from django.contrib.auth.models import User
-from django.db import close_old_connections, connection
+from django.db import connection, transaction
+from django.db.models import Max, Q, QuerySet
 
-from evaweb.accounts.roles import Role, require_role
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.blinding.visibility import Visibility, visibility_for_user
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.core.lock_wait import retry_while_locked
 from evaweb.episodes.folders import episodes_dir
+from evaweb.episodes.models import Episode
+from evaweb.jobs.kinds import JobContext, JobUnfinished, Queue
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.selectors import job_newest
-from evaweb.jobs.services import cancel, enqueue
-from evaweb.plans.allocation import allocate_trial, plan_progress
-from evaweb.plans.counting import fails_by
+from evaweb.jobs.services import OWNER, cancel, enqueue, reclaim_stale_jobs, requeue, work_off
+from evaweb.jobs.workers import has_lab_folder, served
+from evaweb.plans.allocation import (
+    BrokenAgain,
+    NothingLeft,
+    NotYet,
+    allocate_trial,
+    plan_progress,
+    require_allowed,
+)
+from evaweb.plans.counting import ScoreFirst, fails_by
+from evaweb.plans.covered_jobs import Cover, cover_of
 from evaweb.plans.design import dropped_of, findings_of
-from evaweb.plans.models import Plan, PlanState, StoppingRule
+from evaweb.plans.frozen_document import require_checkpoints, require_scene
+from evaweb.plans.models import Handout, Plan, PlanState, StoppingRule
 from evaweb.plans.selectors import without_dropped
-from evaweb.plans.services import end_plan_if_decided
+from evaweb.plans.services import end_plan_if_decided, noted_end
 from evaweb.stations.models import Station
+from evaweb.trials import lifecycle
 from evaweb.trials.models import Scene, Score, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED
-from evaweb.trials.services import dismiss_trial, score_trial
+from evaweb.trials.services import dismiss_trial, register_check, score_trial
 from evaweb.trials.station_commands import run_args, setup_args
 from evaweb.trials.station_events import record_whole_run
 from runtime.benches.schema import UnusableBench
 from runtime.core.environment import without_web_secrets
+from runtime.core.machine import machine_kind
+from runtime.core.sentences import Pattern
+
+_WAITS_FOR_ITS_TURN = Pattern(
+    "plans.copies.waits_for_its_turn",
+    "trial {trial} is scored by the bench's truth when it is its turn, by copies: it can be corrected then",
+)
 
 FOLDER = "farm"  # below the data folder
 JOB = "copies"
-_MOST_ATTEMPTS = 3  # of one trial whose run is interrupted
-_LOOK_S = 1.0  # longest wait until a copy looks again whether it is its trial's turn
+MOST_COPIES = 256  # of one plan that a person may ask for
+_PROGRAM = ("-m", "runtime.standins.trial")
+_LOOK_S = 1.0  # until a copy looks again whether others have scored the trials that come first
+_AHEAD = 2  # trials per copy that may wait for the score of an earlier one
+_POLL_S = 0.5
+_LONGEST_S = 900.0  # for the start of a trial's process and its set-up, after which it counts as hanging
+_SLOWEST = 30.0  # times the trial's time limit, for its run
+_PACE = 20  # newest trials from which the pace is taken
 _DISMISSED = "the plan's design had ended, or dropped its checkpoint, when it was its turn"
 _NOTE = "scored from the bench's truth"
+_settling: ContextVar[bool] = ContextVar(
+    "settling", default=False
+)  # whether this program scores a copy's trial
+_MOVED = ".moved"  # ending of the name of a file that says which recording a run has moved
 _WORDS = 2000  # characters of a process's last words in an error
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +110,6 @@ class Copies:
     assignments: Sequence[str]
     options: Sequence[str]
     servers: Mapping[str, Mapping[str, Any]]
-
-
-class _NothingLeft(Exception):
-    """The plan has no further trial for the station; the message says why."""
 
 
 def write_copies(station: str, copies: Copies) -> None:
@@ -116,39 +144,11 @@ def copies_of(station: Station) -> Copies:
         ) from None
 
 
-def carry_out(*, user: User, plan: Plan, station: Station, count: int, most: int | None, tell: Tell) -> int:
-    """Carry out the next trials of a plan at `count` copies of a station, until none is left; return their number.
-
-    Args:
-        user: Operator of the trials, for whom a blind plan stays blind.
-        plan: A frozen plan.
-        station: A simulated station.
-        count: Number of copies that run at the same time.
-        most: Greatest number of trials; None: all.
-        tell: Called with a line after each trial.
-
-    Raises:
-        EvaError: If a trial cannot be carried out. Trials that other copies have begun are finished first.
-    """
-    copies = _check(plan, station, count)
-    with _alone(station), ThreadPoolExecutor(count, "copy") as pool:
-        run = _Run(user, plan, station, copies, most, tell)
-        work = [
-            pool.submit(run.work, f"{platform.node()}:{os.getpid()}/{number}"[-60:])
-            for number in range(count)
-        ]
-        try:
-            return sum(done.result() for done in work)
-        except BaseException:
-            run.stop()
-            raise
-
-
 def _check(plan: Plan, station: Station, count: int) -> Copies:
     """Return how copies of the station are started. Raises: EvaError if the plan cannot be carried out at them."""
     copies = copies_of(station)
-    if count < 1:
-        raise EvaError(f"{count} copies; allowed: 1 or more")
+    if not 1 <= count <= MOST_COPIES:
+        raise EvaError(f"{count} copies; allowed: 1 to {MOST_COPIES}")
     _require_reports(plan)
     if plan.match_gate is not None:
         raise EvaError(
@@ -177,43 +177,80 @@ def _require_reports(plan: Plan) -> None:
                 )
 
 
-def request_trials(*, user: User, plan: Plan, station: Station, count: int) -> Job:
-    """Queue the job that carries out the plan's trials at `count` copies of a station, until none is left.
+# --- as jobs ---------------------------------------------------------------------------------------------------
+
+
+def request_trials(
+    *, user: User, plan: Plan, station: Station, count: int, most: int | None = None
+) -> list[Job]:
+    """Queue `count` jobs, each of which carries out trials of the plan at a copy of a station until none is left.
+
+    `most` is the greatest number of trials that all of them begin; None: all.
 
     Raises:
         EvaError: If a trial of the plan could not be carried out so.
     """
     require_role(user, Role.OPERATOR)
     _check(plan, station, count)
-    if plan.state != PlanState.FROZEN:
-        raise Conflict(f"{plan} is {plan.get_state_display()}: only trials of a running plan are carried out")
-    if is_at_work(job_newest(key=_key(plan))):
+    require_allowed(plan, user, station)
+    if jobs_at_work(plan):
         raise Conflict(f"trials of {plan} are carried out already: pause that first")
-    args = {"plan": plan.pk, "station": station.pk, "user": user.pk, "count": count}
-    return enqueue(kind=JOB, key=_key(plan), args=args)
+    first = plan.handouts.aggregate(last=Max("number"))["last"] or 0
+    args = {
+        "plan": plan.pk,
+        "station": station.pk,
+        "user": user.pk,
+        "count": count,
+        "first": first,
+        "most": most,
+    }
+    with transaction.atomic():
+        return [
+            enqueue(kind=JOB, key=f"{keys_of(plan)}{number}", args={**args, "copy": number})
+            for number in range(1, count + 1)
+        ]
 
 
-def pause_trials(*, user: User, plan: Plan) -> Job:
+def pause_trials(*, user: User, plan: Plan) -> None:
     """Let no further trial begin; those at work are finished. Raises: Conflict if none is carried out."""
     require_role(user, Role.OPERATOR)
-    job = job_newest(key=_key(plan))
-    if job is None or not is_at_work(job):
+    jobs = jobs_at_work(plan)
+    if not jobs:
         raise Conflict(f"no trial of {plan} is carried out at copies: there is nothing to pause")
-    return cancel(user=user, job=job)
+    for job in jobs:
+        cancel(user=user, job=job)
 
 
-def job_of(plan: Plan) -> Job | None:
-    """Return the newest job that carries out trials of the plan, None if there is none."""
-    return job_newest(key=_key(plan))
+def keys_of(plan: Plan) -> str:
+    """Return how the keys of the jobs begin that carry out trials of the plan."""
+    return f"{JOB}:{plan.pk}:"
 
 
-def is_at_work(job: Job | None) -> bool:
-    """Return True while trials are carried out, or are about to be."""
-    return (
-        job is not None
-        and job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
-        and job.cancelled_by_id is None
-    )
+def jobs_at_work(plan: Plan) -> list[Job]:
+    """Return the jobs that carry out trials of the plan, or are about to."""
+    active = _jobs(plan).filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING), cancelled_by=None)
+    return list(active.order_by("pk"))
+
+
+def job_ended_last(plan: Plan) -> Job | None:
+    """Return the job of the last start that ended; None if there is none, or the last start was paused.
+
+    Of several, it is one that failed or else stopped before no trial was left.
+    """
+    ended = _jobs(plan).filter(status__in=(JobStatus.DONE, JobStatus.FAILED)).order_by("-finished_at")
+    last = ended.first()
+    if last is None or last.cancelled_by_id is not None:
+        return None
+    together = ended.filter(args__first=last.args.get("first"), cancelled_by=None)
+    return max(together, key=lambda job: (bool(job.error), "stopped" in job.result), default=last)
+
+
+def _why_ended(job: Job) -> str:
+    return job.error or str(job.result.get("stopped") or job.result.get("ended", ""))
+
+
+def _jobs(plan: Plan) -> QuerySet[Job]:
+    return Job.objects.filter(kind=JOB, key__startswith=keys_of(plan))
 
 
 def stations_with_copies(plan: Plan) -> list[Station]:
@@ -225,25 +262,46 @@ def stations_with_copies(plan: Plan) -> list[Station]:
     return list(rows.filter(pk__in=plan.stations.all()) if plan.stations.exists() else rows)
 
 
-def carry_out_some(args: Mapping[str, Any], report: Tell) -> dict[str, int]:
-    """Carry out two trials per copy, and queue the job again if more are left, so that other jobs get their turn."""
-    plan, user = Plan.objects.get(pk=args["plan"]), User.objects.get(pk=args["user"])
-    station, count = Station.objects.get(pk=args["station"]), int(args["count"])
+@dataclass(frozen=True, slots=True)
+class CopiesState:
+    """How trials of a plan are carried out at copies.
 
-    def on_line(line: str) -> None:
-        progress = plan_progress(plan)
-        report(f"trial {min(progress.counted + 1, progress.total)} of {progress.total}")
+    Attributes:
+        copies: Number of copies, and how many of them are `running`.
+        lacks: Why no worker runs them, "" if some do.
+        counted, total: Trials that count, and all.
+        left_s: Time until all are scored [s], None if unknown.
+        ended: Why the last copies ended before the plan, "" if they did not; `hidden` if it may name what is hidden
+            from the user.
+    """
 
-    on_line("")
-    made = carry_out(user=user, plan=plan, station=station, count=count, most=2 * count, tell=on_line)
-    left = trials_left(plan)
-    if made and left:
-        enqueue(kind=JOB, key=_key(plan), args=args)
-    return {"made": made, "left": left}
+    copies: int
+    running: int
+    lacks: str
+    counted: int
+    total: int
+    left_s: float | None
+    ended: str
+    hidden: bool
 
 
-def _key(plan: Plan) -> str:
-    return f"{JOB}:{plan.pk}"
+def copies_state(plan: Plan, sight: Visibility) -> CopiesState:
+    """Return how trials of the plan are carried out at copies, as the user may see it."""
+    jobs, last, progress = jobs_at_work(plan), job_ended_last(plan), plan_progress(plan)
+    why = ""
+    if not jobs and last is not None and progress.counted < progress.total:
+        why = _why_ended(last)
+    hidden = last is not None and bool(why) and cover_of(last, sight) is not Cover.NOTHING
+    return CopiesState(
+        copies=len(jobs),
+        running=sum(job.status == JobStatus.RUNNING for job in jobs),
+        lacks=next(filter(None, map(served().lacks, jobs)), "") if jobs else "",
+        counted=progress.counted,
+        total=progress.total,
+        left_s=time_left_s(plan),
+        ended="" if hidden else why,
+        hidden=hidden,
+    )
 
 
 def trials_left(plan: Plan) -> int:
@@ -252,179 +310,408 @@ def trials_left(plan: Plan) -> int:
     return progress.total - progress.counted if fresh.state == PlanState.FROZEN else 0
 
 
-class _Run:
-    """Trials of one plan at copies of one station, each copy in a thread.
+def time_left_s(plan: Plan) -> float | None:
+    """Return the time until all trials of the plan are scored, at the pace of the newest ones [s]; None: unknown."""
+    jobs = jobs_at_work(plan)
+    if not jobs:
+        return None
+    since = min(job.created_at for job in jobs)
+    newest = _at_copies(plan).filter(verdict__scored_at__gte=since).order_by("-verdict__pk")[:_PACE]
+    times = [(trial.prepared_at, trial.verdict.scored_at) for trial in newest if trial.verdict]
+    if not times:
+        return None
+    took = max(scored for _, scored in times) - max(since, min(prepared for prepared, _ in times))
+    return took.total_seconds() / len(times) * trials_left(plan)
 
-    If the plan's design may end early, trials are scored in the order of the schedule, so that what counts does not
-    depend on the number of copies: a copy whose trial has ended waits until all earlier ones are scored.
+
+def lines_of_settled(plan: Plan, known: set[int]) -> Iterator[str]:
+    """Yield a line about each trial at a copy that is settled and not `known`, to which it is added.
+
+    The lines reveal nothing of a blind plan.
     """
-
-    def __init__(
-        self, user: User, plan: Plan, station: Station, copies: Copies, most: int | None, tell: Tell
-    ) -> None:
-        self._user, self._plan, self._station = user, plan, station
-        self._copies, self._left, self._tell = copies, most, tell
-        self._early = plan.stopping != StoppingRule.NONE or plan.drop_arms
-        self._turn = threading.Condition()
-        self._running = 0  # copies that may still score a trial for which others wait
-        self._begun = _begun_before(plan, station)
-
-    def stop(self) -> None:
-        """Let no further trial begin."""
-        with self._turn:
-            self._left = 0
-            self._turn.notify_all()
-
-    def work(self, worker: str) -> int:
-        """Carry out trials one after the other, and return their number."""
-        count = 0
-        with self._turn:
-            self._running += 1
-        try:
-            while self._may_begin():
-                try:
-                    self._carry_out(worker)
-                except _NothingLeft as why:
-                    if not count:
-                        self._tell(str(why))
-                    break
-                count += 1
-        except BaseException:
-            self.stop()
-            raise
-        finally:
-            connection.close()
-            with self._turn:
-                self._running -= 1
-                self._turn.notify_all()
-        return count
-
-    def _may_begin(self) -> bool:
-        with self._turn:
-            if self._left == 0:
-                return False
-            self._left = None if self._left is None else self._left - 1
-            return True
-
-    def _carry_out(self, worker: str) -> None:
-        close_old_connections()
-        started = time.monotonic()
-        trial = self._next(worker)
-        folder = _folder() / "trials" / str(trial.uuid)
-        if trial.status == TrialStatus.PREPARED:
-            result = _run_process(folder, trial, self._user, self._copies)
-            trial = retry_while_locked(lambda: _record(trial, result))
-        shutil.rmtree(folder, ignore_errors=True)
-        self._settle(trial)
-        trial.refresh_from_db()
-        if trial.status == TrialStatus.INTERRUPTED and trial.attempt >= _MOST_ATTEMPTS:
-            raise EvaError(f"trial {trial.pk} was interrupted {trial.attempt} times: {trial.reason}")
-        self._tell(_line(self._plan, trial, time.monotonic() - started))
-
-    def _next(self, worker: str) -> Trial:
-        """Return a trial that was begun before this program was started, or the next of the plan."""
-        with self._turn:
-            if self._begun:
-                return self._begun.pop(0)
-        try:
-            handout = retry_while_locked(
-                lambda: allocate_trial(user=self._user, station=self._station, plan=self._plan, worker=worker)
-            )
-        except Conflict as conflict:
-            others = Trial.objects.filter(handout__plan=self._plan, status__in=UNFINISHED).exists()
-            if trials_left(self._plan) and not others:
-                raise
-            raise _NothingLeft(str(conflict)) from None
-        return handout.trial
-
-    def _settle(self, trial: Trial) -> None:
-        """Score the trial, at once or in its turn."""
-        if not self._early:
-            if _is_to_be_scored(self._plan, trial):
-                retry_while_locked(lambda: _score(trial, self._user))
-            return
-        with self._turn:
-            self._settle_in_order()
-            self._turn.notify_all()
-            self._running -= 1
-            try:
-                while self._waits(trial):
-                    self._turn.wait(_LOOK_S)
-            finally:
-                self._running += 1
-
-    def _waits(self, trial: Trial) -> bool:
-        """Return True while an earlier trial, which another copy runs, has to be scored first."""
-        trial.refresh_from_db()
-        return _is_to_be_scored(self._plan, trial) and self._running > 0
-
-    def _settle_in_order(self) -> None:
-        """Score the trials whose turn it is, and dismiss those that the design does not need any more."""
-        while (trial := _first_unscored(self._plan)) is not None and _is_to_be_scored(self._plan, trial):
-            retry_while_locked(partial(_score, trial, self._user))
-            dropped = dropped_of(self._plan)
-            result = findings_of(self._plan)
-            for other in Trial.objects.filter(handout__plan=self._plan, verdict=None).exclude(worker=None):
-                slot = other.handout.slot
-                is_dropped = dropped.get(slot.checkpoint.name, slot.block + 1) <= slot.block
-                if is_dropped or (result is not None and result.ended == "boundary"):
-                    retry_while_locked(partial(dismiss_trial, trial=other, reason=_DISMISSED))
-            if result is not None and result.ended == "boundary":
-                retry_while_locked(partial(end_plan_if_decided, user=self._user, plan=self._plan, asked=True))
-                return
+    for trial in _at_copies(plan).exclude(pk__in=known).order_by("handout__number"):
+        if trial.status in lifecycle.OPEN_STATES or is_to_be_scored(plan, trial):
+            continue
+        known.add(trial.pk)
+        yield _line(plan, trial)
 
 
-def _begun_before(plan: Plan, station: Station) -> list[Trial]:
-    """Return the trials at copies of the station that an earlier program has left unfinished, in order.
-
-    Raises:
-        EvaError: If one is of another plan.
-    """
-    rows = Trial.objects.filter(station=station, status__in=UNFINISHED).exclude(worker=None)
-    rows = rows.select_related("handout__plan").order_by("handout__number")
-    for trial in rows:
-        if trial.handout.plan_id != plan.pk:
-            raise EvaError(
-                f"trial {trial.pk} at a copy of {station.name} is unfinished: carry out {trial.handout.plan} first"
-            )
-    return list(rows)
-
-
-def _first_unscored(plan: Plan) -> Trial | None:
-    """Return the newest attempt at the first slot of the schedule that does not count yet, None if it has none."""
-    counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
-    slots = without_dropped(plan.slots.exclude(pk__in=counted), dropped_of(plan))
-    slot = slots.order_by("index").first()
-    handout = slot and slot.handouts.select_related("trial").order_by("-number").first()
-    return handout.trial if handout else None
-
-
-def _is_to_be_scored(plan: Plan, trial: Trial) -> bool:
-    interrupted = trial.status == TrialStatus.INTERRUPTED and trial.verdict_id is None
-    return trial.status == TrialStatus.ENDED or (interrupted and fails_by(plan, trial))
-
-
-def _line(plan: Plan, trial: Trial, seconds: float) -> str:
-    """Return a line about a trial, which reveals nothing of a blind plan."""
+def _line(plan: Plan, trial: Trial) -> str:
     progress = plan_progress(plan)
     outcome = str(TrialStatus(trial.status).label)
     if trial.verdict is not None:
         outcome = f"{'success' if trial.verdict.success else 'no success'}, {trial.verdict.score:.0%}"
-    lasted = f"{trial.duration_s or 0.0:.1f} s in {seconds:.1f} s"
     return (
         f"{progress.counted:>4} of {progress.total}  {trial.handout.code}  position {trial.position.number}  "
-        f"{outcome}, {lasted}"
+        f"{outcome}, {trial.duration_s or 0.0:.1f} s"
     )
 
 
+def carry_out(
+    *, user: User, plan: Plan, station: Station, count: int, most: int | None, tell: Callable[[str], None]
+) -> None:
+    """Carry out trials of the plan in this program, and in the workers of the lab if there are any, until none is left.
+
+    `tell` is called with a line about each trial. The other arguments are those of `request_trials`.
+
+    Raises:
+        EvaError: If a trial cannot be carried out.
+    """
+    if not has_lab_folder():
+        raise EvaError(
+            f"{settings.DATA_DIR} is not the lab's data folder; allowed: the one that the web uses"
+        )
+    reclaim_stale_jobs()
+    if Queue.COPIES not in served().queues:
+        for job in jobs_at_work(plan):
+            if job.status == JobStatus.QUEUED:  # of a program that was killed
+                cancel(user=user, job=job)
+    known = set(_at_copies(plan).exclude(status__in=UNFINISHED).values_list("pk", flat=True))
+    jobs = request_trials(user=user, plan=plan, station=station, count=count, most=most)
+    for _ in jobs:
+        threading.Thread(target=_work_off, args=(plan,), daemon=True).start()
+    told: set[tuple[int, str]] = set()
+    try:
+        while active := jobs_at_work(plan):
+            lines = [_error_of(job, user) for job in active if job.error and (job.pk, job.error) not in told]
+            told |= {(job.pk, job.error) for job in active}
+            for line in (*lines, *lines_of_settled(plan, known)):
+                tell(line)
+            time.sleep(_POLL_S)
+    except BaseException:
+        with suppress(Conflict):  # the last one has just ended
+            pause_trials(user=user, plan=plan)
+        requeue(owner=OWNER)
+        raise
+    for line in lines_of_settled(plan, known):
+        tell(line)
+    last = job_ended_last(plan)
+    if last is not None and last.error:
+        raise EvaError(_error_of(last, user))
+    if last is not None and trials_left(plan):
+        tell(_why_ended(last))
+
+
+def _error_of(job: Job, user: User) -> str:
+    hidden = cover_of(job, visibility_for_user(user)) is not Cover.NOTHING
+    return (
+        "a trial failed, and the reason may name what is hidden from you: ask the plan's owner"
+        if hidden
+        else job.error
+    )
+
+
+def _work_off(plan: Plan) -> None:
+    try:
+        while jobs_at_work(plan):
+            if not work_off(Queue.COPIES, keys_of(plan)):
+                time.sleep(_POLL_S)
+    finally:
+        connection.close()
+
+
+# --- one trial after the other -----------------------------------------------------------------------------------
+
+
+def carry_out_next(work: JobContext) -> Mapping[str, Any]:
+    """Carry out the next trial of a plan at a copy of a station.
+
+    Returns:
+        `ended`, why no trial is left, or `stopped`, why this copy carries out no further one.
+
+    Raises:
+        JobUnfinished: The next trial is still to be carried out.
+        EvaError: A trial cannot be carried out; it is run again at the next start.
+    """
+    args = work.args
+    plan = Plan.objects.select_related("evaluation", "owner").get(pk=args["plan"])
+    user, station = User.objects.get(pk=args["user"]), Station.objects.get(pk=args["station"])
+    progress = plan_progress(plan)
+    work.report_progress(f"trial {min(progress.counted + 1, progress.total)}/{progress.total}")
+    copies = _check(plan, station, args["count"])
+    settle_trials(plan, user)
+    trial = _begun_before(plan, station, args["copy"])
+    if trial is None:
+        if _is_far_ahead(plan, station, args["count"]):
+            raise JobUnfinished(_LOOK_S)
+        try:
+            trial = _next(plan, station, user, args)
+        except NothingLeft as nothing:
+            _discard_leftovers()
+            return {"ended": str(nothing)}
+        except BrokenAgain as why:
+            return {"stopped": str(why)}
+        except (ScoreFirst, NotYet) as first:
+            if first.trial is None or first.trial.worker:
+                raise JobUnfinished(_LOOK_S) from None
+            return {"stopped": str(first)}
+    require_scene(plan, trial.scene)
+    require_checkpoints(plan)
+    run_trial(trial, user, copies)
+    settle_trials(plan, user)
+    raise JobUnfinished
+
+
+def _next(plan: Plan, station: Station, user: User, args: Mapping[str, Any]) -> Trial:
+    worker = _worker(plan, args["copy"])
+    handout = retry_while_locked(
+        lambda: allocate_trial(
+            user=user, station=station, plan=plan, worker=worker, first=args["first"], most=args["most"]
+        )
+    )
+    return handout.trial
+
+
+def _worker(plan: Plan, number: int) -> str:
+    return f"{plan.pk}.{number} {platform.node()[:30]} {machine_kind()}"
+
+
+def _begun_before(plan: Plan, station: Station, number: int) -> Trial | None:
+    """Return a trial that was handed out to this copy, or to one that is not at work any more, and has not been run."""
+    rows = _at_copies(plan).filter(station=station, status=TrialStatus.PREPARED).order_by("handout__number")
+    mine = rows.filter(worker__startswith=f"{plan.pk}.{number} ").first()
+    if mine is not None:
+        return mine
+    active = _jobs(plan).filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING))
+    others = [f"{plan.pk}.{args['copy']} " for args in active.values_list("args", flat=True)]
+    for trial in rows:
+        if not str(trial.worker).startswith(tuple(others)):
+            orphan = Trial.objects.filter(pk=trial.pk, status=TrialStatus.PREPARED, worker=trial.worker)
+            if retry_while_locked(partial(orphan.update, worker=_worker(plan, number))):
+                return trial
+    return None
+
+
+def _is_far_ahead(plan: Plan, station: Station, count: int) -> bool:
+    """Return True while many trials wait for the score of an earlier one, which another copy runs."""
+    first = _first_unscored(plan, station.pk) if ends_early(plan) else None
+    if first is None or first.status not in lifecycle.OPEN_STATES:
+        return False
+    rows = _at_copies(plan).filter(station=station, verdict=None)
+    return sum(is_to_be_scored(plan, trial) for trial in rows) >= _AHEAD * count
+
+
+# --- scores ------------------------------------------------------------------------------------------------------
+
+
+def ends_early(plan: Plan) -> bool:
+    """Return True if the plan's design may end, or drop a checkpoint, before all trials are made."""
+    return bool(plan.stopping != StoppingRule.NONE or plan.drop_arms)
+
+
+def settle_trials(plan: Plan, user: User) -> None:
+    """Score the trials at copies that have ended, by the bench's truth.
+
+    If the plan's design may end early, those of each station are scored in the order of the schedule, so that what
+    counts does not depend on the number of copies, and trials that the design does not need are dismissed. Any number
+    of programs may do so at the same time: each decides on a trial after all that come before it count.
+    """
+    waiting = [trial for trial in _at_copies(plan).filter(verdict=None) if is_to_be_scored(plan, trial)]
+    if not ends_early(plan):
+        for trial in waiting:
+            _score(trial, user)
+        return
+    stations = {trial.handout.slot.station_id for trial in waiting}
+    for station in stations:
+        while True:
+            first = _first_unscored(
+                plan, station
+            )  # before the findings, which so have all that comes before it
+            if _has_ended(plan, user) or first is None or not is_to_be_scored(plan, first):
+                break
+            _score(first, user)
+    if not stations:
+        _has_ended(plan, user)
+
+
+def _has_ended(plan: Plan, user: User) -> bool:
+    """Dismiss the trials at copies that the design does not need, and return True if it has ended."""
+    dropped, result = dropped_of(plan), findings_of(plan)
+    ended = bool(noted_end(plan)) or (result is not None and result.ended == "boundary")
+    counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
+    unscored = (TrialStatus.PREPARED, TrialStatus.ENDED, TrialStatus.INTERRUPTED)
+    for trial in (
+        _at_copies(plan).filter(verdict=None, status__in=unscored).exclude(handout__slot__in=counted)
+    ):
+        slot = trial.handout.slot
+        if ended or dropped.get(slot.checkpoint.name, slot.block + 1) <= slot.block:
+            retry_while_locked(partial(dismiss_trial, trial=trial, reason=_DISMISSED))
+    if ended:
+        retry_while_locked(partial(end_plan_if_decided, user=user, plan=plan, asked=True))
+    return ended
+
+
+def _first_unscored(plan: Plan, station: int | None) -> Trial | None:
+    """Return the newest attempt at the station's first slot of the schedule that does not count; None before any.
+
+    Slots that people run are left out: they do not wait for copies, nor copies for them.
+    """
+    counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
+    slots = without_dropped(plan.slots.filter(station_id=station).exclude(pk__in=counted), dropped_of(plan))
+    for slot in slots.order_by("index"):
+        handout = slot.handouts.select_related("trial").order_by("-number").first()
+        trial = handout.trial if handout else None
+        if trial is None or trial.status in lifecycle.REPEATABLE_STATES or _is_of_copies(plan, trial):
+            return trial
+    return None
+
+
+def _is_of_copies(plan: Plan, trial: Trial) -> bool:
+    """Return True if copies run the trial, or will score it; a trial without a truth waits for a person."""
+    return bool(trial.worker) and (trial.status in lifecycle.OPEN_STATES or is_to_be_scored(plan, trial))
+
+
+def is_to_be_scored(plan: Plan, trial: Trial) -> bool:
+    """Return True if the trial was run at a copy, and has no score though the plan counts it and the bench knows it."""
+    if not trial.worker or trial.verdict_id is not None or trial.truth is None:
+        return False
+    interrupted = trial.status == TrialStatus.INTERRUPTED
+    return trial.status == TrialStatus.ENDED or (interrupted and fails_by(plan, trial))
+
+
+def _at_copies(plan: Plan) -> QuerySet[Trial]:
+    rows = Trial.objects.filter(~Q(worker=None), handout__plan=plan)
+    return rows.select_related(
+        "handout__slot__checkpoint", "verdict", "episode", "scene", "position", "station"
+    )
+
+
+def _score(trial: Trial, user: User) -> None:
+    """Score the trial by the bench's ground truth, unless a person has scored it meanwhile.
+
+    The rater is its operator or, if that person is no operator any more, `user`.
+    """
+    rater = user if role_of(trial.operator) is Role.VIEWER else trial.operator
+
+    def score() -> None:
+        try:
+            score_trial(
+                user=rater,
+                trial=trial,
+                milestones={},
+                note=_NOTE,
+                source=Score.Source.TRUTH,
+                uuid=uuid5(trial.uuid, "truth"),  # a repetition is the same score
+            )
+        except Conflict:
+            trial.refresh_from_db()
+            if is_to_be_scored(trial.handout.plan, trial):
+                raise
+
+    settling = _settling.set(True)
+    try:
+        retry_while_locked(score)
+    finally:
+        _settling.reset(settling)
+
+
+def _require_turn(action: str, trial: Trial, user: Any) -> None:
+    """Raise Conflict if a person scores a trial of a copy that waits for its turn."""
+    if action != "scored" or _settling.get() or not trial.worker:
+        return
+    handout = Handout.objects.select_related("plan").filter(trial=trial).first()
+    if handout is not None and handout.plan.state == PlanState.FROZEN and ends_early(handout.plan):
+        trial = _at_copies(handout.plan).get(pk=trial.pk)
+        if is_to_be_scored(handout.plan, trial):
+            raise Conflict(_WAITS_FOR_ITS_TURN(trial=trial.pk))
+
+
+register_check(_require_turn)
+
+
+# --- the process of a trial ---------------------------------------------------------------------------------------
+
+
+def run_trial(trial: Trial, user: User, copies: Copies) -> Trial:
+    """Run the trial in a process of its own, and record the run."""
+    own = _folder() / "trials" / str(trial.uuid)
+    with _alone(own):
+        _discard_moved(own)
+        folder = Path(tempfile.mkdtemp(dir=own))
+        result = _run_process(folder, trial, user, copies)
+        trial.refresh_from_db()
+        if trial.status == TrialStatus.PREPARED:
+            _move_recording(trial, result, own)
+            trial = retry_while_locked(
+                lambda: record_whole_run(
+                    trial=trial, events=result["events"], state=result["state"], reason=result["reason"]
+                )
+            )
+        _discard_moved(own)
+        shutil.rmtree(own, ignore_errors=True)
+    return trial
+
+
+@contextmanager
+def _alone(own: Path) -> Iterator[None]:
+    """Hold the folder of a trial during the block. Raises: JobUnfinished if another copy on this disk has it."""
+    own.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(own, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise JobUnfinished(_LOOK_S) from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _move_recording(trial: Trial, result: Mapping[str, Any], own: Path) -> None:
+    """Move the recording of a trial to those of the lab; a file of the trial's own folder says which.
+
+    Raises:
+        EvaError: The recording is not there, or not whole.
+    """
+    made = Path((result["episode"] or {}).get("path") or "")
+    if not made.name:
+        return  # none was opened
+    waits = any(
+        event["kind"] == "episode_closed" and event["data"].get("waits") for event in result["events"]
+    )
+    if waits or not made.exists():
+        raise EvaError(
+            f"trial {trial.pk}: its recording {made.name} "
+            + ("waits for room on the disk: make some" if waits else "is not there any more")
+        )
+    (own / f"{made.name}{_MOVED}").touch()
+    episodes_dir().mkdir(parents=True, exist_ok=True)
+    arriving = episodes_dir() / f".{made.name}"
+    shutil.move(
+        made, arriving
+    )  # may be another file system: a copy, which has no final name before it is whole
+    arriving.replace(episodes_dir() / made.name)
+
+
+def _discard_moved(own: Path) -> None:
+    """Remove the recordings that a run of the trial has moved to those of the lab, and that no row names."""
+    for file in own.glob(f"*{_MOVED}"):
+        name = file.name.removesuffix(_MOVED)
+        if not Episode.objects.filter(uuid=name).exists():
+            for path in (episodes_dir() / f".{name}", episodes_dir() / name):
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def _discard_leftovers() -> None:
+    """Remove the folders of trials that will not be run again, such as those that a person has abandoned."""
+    folders = list(
+        (_folder() / "trials").glob("*")
+    )  # before the query: a trial has its row before its folder
+    begun = Trial.objects.filter(~Q(worker=None), status=TrialStatus.PREPARED).values_list("uuid", flat=True)
+    needed = set(map(str, begun))
+    for own in folders:
+        if own.name not in needed:
+            with suppress(JobUnfinished), _alone(own):
+                _discard_moved(own)
+                shutil.rmtree(own, ignore_errors=True)
+
+
 def _run_process(folder: Path, trial: Trial, user: User, copies: Copies) -> Mapping[str, Any]:
-    """Run the trial in a process of its own, unless it has been run already, and return its result."""
-    kept = folder / "result.json"
-    if kept.exists():
-        done: Mapping[str, Any] = json.loads(kept.read_bytes())
-        return done
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    """Run the trial in a process of its own, which works in `folder`, and return its result.
+
+    Raises:
+        EvaError: The process failed.
+    """
     orders = _orders(trial, user)
     policy = orders["setup"]["policy"]
     serving: list[str] = []
@@ -436,7 +723,7 @@ def _run_process(folder: Path, trial: Trial, user: User, copies: Copies) -> Mapp
         f"data_dir={json.dumps(str(folder))}",
         f"station={json.dumps(trial.station.name)}",
     ]
-    command = [sys.executable, "-m", "runtime.standins.trial", copies.deployment, "--lifeline"]
+    command = [sys.executable, *_PROGRAM, copies.deployment, "--lifeline"]
     command += [*copies.options, *serving, *(part for assignment in sets for part in ("--set", assignment))]
     with (folder / "log").open("wb") as log:
         child = subprocess.Popen(
@@ -450,12 +737,18 @@ def _run_process(folder: Path, trial: Trial, user: User, copies: Copies) -> Mapp
         assert child.stdin is not None
         assert child.stdout is not None
         try:
-            child.stdin.write(json.dumps(orders).encode() + b"\n")
-            child.stdin.flush()
+            with suppress(BrokenPipeError):  # it has failed already
+                child.stdin.write(json.dumps(orders).encode() + b"\n")
+                child.stdin.flush()
+            overdue = threading.Timer(_LONGEST_S + _SLOWEST * (trial.time_limit_s or 0.0), child.kill)
+            overdue.daemon = True
+            overdue.start()
             answer = child.stdout.read()
             code = child.wait()
+            overdue.cancel()
         finally:
-            child.stdin.close()
+            with suppress(BrokenPipeError):
+                child.stdin.close()  # kills it if it is still running
             child.stdout.close()
             child.wait()
     if code:
@@ -463,9 +756,6 @@ def _run_process(folder: Path, trial: Trial, user: User, copies: Copies) -> Mapp
         raise EvaError(
             f"trial {trial.pk} at a copy of {trial.station.name} failed ({code}): {words.splitlines()[-1:]}"
         )
-    new = kept.with_suffix(".new")
-    new.write_bytes(answer)
-    new.replace(kept)
     result: Mapping[str, Any] = json.loads(answer)
     return result
 
@@ -478,43 +768,6 @@ def _orders(trial: Trial, user: User) -> dict[str, dict[str, Any]]:
         json.dumps({"setup": setup, "run": run_args(trial, user)}, default=str)
     )
     return orders
-
-
-def _record(trial: Trial, result: Mapping[str, Any]) -> Trial:
-    """Move the trial's recording to those of the lab, and record the run."""
-    made = Path(result["episode"].get("path") or "")
-    if made.name and made.exists():
-        episodes_dir().mkdir(parents=True, exist_ok=True)
-        made.replace(episodes_dir() / made.name)
-    return record_whole_run(
-        trial=trial, events=result["events"], state=result["state"], reason=result["reason"]
-    )
-
-
-def _score(trial: Trial, user: User) -> None:
-    """Score the trial by the bench's ground truth."""
-    score_trial(
-        user=user,
-        trial=trial,
-        milestones={},
-        note=_NOTE,
-        source=Score.Source.TRUTH,
-        uuid=uuid5(trial.uuid, "truth"),  # a repetition after a kill is the same score
-    )
-
-
-@contextmanager
-def _alone(station: Station) -> Iterator[None]:
-    """Hold the copies of a station during the block. Raises: Conflict if another program holds them."""
-    _folder().mkdir(parents=True, exist_ok=True)
-    with (_folder() / f"{station.name}.lock").open("a+") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise Conflict(
-                f"another program carries out trials at copies of {station.name}: end it first"
-            ) from None
-        yield
 
 
 def _folder() -> Path:

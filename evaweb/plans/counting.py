@@ -29,7 +29,16 @@ _SCORE_IT_FIRST = Pattern(
     "trial {trial} was ended by {what}: by {plan} that is a failure; score it before the next one",
 )
 
+
 ENDS = {f"on_{name}": words for name, words in ENDINGS.items()}
+
+
+class ScoreFirst(Conflict):
+    """Error if the previous attempt at a slot, `trial`, has to be scored before the next one."""
+
+    def __init__(self, trial: Trial, plan: Plan) -> None:
+        super().__init__(_SCORE_IT_FIRST(trial=trial.pk, what=ENDS[ended_by(trial)], plan=plan))
+        self.trial = trial
 
 
 def ended_by(trial: Trial) -> str:
@@ -54,11 +63,11 @@ def end_of(kept: str | None, status: str, reason: str, recording: str | None) ->
 
 
 def require_scored_first(plan: Plan, before: Trial | None) -> None:
-    """Raise Conflict if the previous attempt counts as a failure by the plan and is not scored yet."""
+    """Raise ScoreFirst if the previous attempt counts as a failure by the plan and is not scored yet."""
     if before is None or before.status != TrialStatus.INTERRUPTED:
         return
     if fails_by(plan, before):
-        raise Conflict(_SCORE_IT_FIRST(trial=before.pk, what=ENDS[ended_by(before)], plan=plan))
+        raise ScoreFirst(before, plan)
 
 
 def fails_by(plan: Plan, trial: Trial) -> bool:
@@ -99,7 +108,7 @@ def _judged(action: str, trial: Trial, user: Any) -> None:
     counts = getattr(handout.plan, end)
     if action == "voided":  # a single operator could void an unscored failure to have it repeated
         if trial.verdict_id is None and fails_by(handout.plan, trial):
-            raise Conflict(_SCORE_IT_FIRST(trial=trial.pk, what=ENDS[end], plan=handout.plan))
+            raise ScoreFirst(trial, handout.plan)
         return
     if counts == CountsAs.REPEATED:
         raise Conflict(_REPEATED(trial=trial.pk, what=ENDS[end], plan=handout.plan))

@@ -31,7 +31,8 @@ def cover_of(job: Job, sight: Visibility) -> Cover:
         if episode is not None and sight.hides_episode(episode):
             return Cover.ALL
         return Cover.WORDS if sight.named_in(f"{job.progress} {job.error}") else Cover.NOTHING
-    return Cover.ALL if job.args.get("plan") in sight.keys else Cover.WORDS
+    names_a_checkpoint = "template" in job.args
+    return Cover.ALL if names_a_checkpoint or job.args.get("plan") in sight.keys else Cover.WORDS
 
 
 def _episode(uuid: Any) -> Episode | None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
+from typing import Any
+from urllib.parse import quote
 
 from django.conf import settings
+from django.core.exceptions import ValidationError
 from django.core.validators import MaxValueValidator, MinValueValidator
 from django.db import models
 from django.db.models import Q
@@ -13,7 +17,7 @@ from evaweb.core.printed_names import check_name
 from evaweb.records.append_only import AppendOnly
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Trial
-from evaweb.trials.tables import check_strategy
+from evaweb.trials.tables import check_policy, check_strategy
 
 
 class PlanState(models.TextChoices):
@@ -452,3 +456,112 @@ class CameraCheck(models.Model):
 
     def __str__(self) -> str:
         return f"{self.station}, {self.by}, {self.at:%Y-%m-%d %H:%M}"
+
+
+class PlanTemplate(models.Model):
+    """Rule by which each newly registered checkpoint gets a plan like another one, in place of one of its checkpoints.
+
+    Programs that register a checkpoint name the template, which says how its policy is reached.
+    """
+
+    name = models.SlugField(
+        max_length=40, unique=True, help_text="In the address at which programs register."
+    )
+    title = models.CharField(
+        max_length=100,
+        blank=True,
+        validators=[check_name],
+        help_text="Of the plans, with a number after it; empty: as the plan below.",
+    )
+    plan = models.ForeignKey(
+        Plan,
+        on_delete=models.PROTECT,
+        related_name="templates",
+        help_text="Its positions, rules, other checkpoints and owner are those of the new plans.",
+    )
+    arm = models.ForeignKey(
+        Checkpoint,
+        on_delete=models.PROTECT,
+        related_name="+",
+        verbose_name="in place of",
+        help_text="The plan's checkpoint in whose place the new one is tried.",
+    )
+    tag = models.CharField(
+        max_length=40,
+        blank=True,
+        help_text="Every checkpoint that is registered with this tag gets a plan; empty: only those of programs.",
+    )
+    policy = models.JSONField(
+        default=dict,
+        blank=True,
+        help_text="Keys of the [policy] table of checkpoints that programs register; {name} and {digest} in its texts "
+        'are those of the checkpoint, e.g. {"url": "ws://gpu-1:8000/{name}"}.',
+    )
+    station = models.ForeignKey(
+        Station,
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="+",
+        help_text="Simulated station at whose copies the trials are carried out at once; empty: they wait for people.",
+    )
+    copies = models.PositiveSmallIntegerField(
+        default=1,
+        validators=[MinValueValidator(1), MaxValueValidator(256)],  # as copies.MOST_COPIES
+        help_text="How many trials at the same time.",
+    )
+    active = models.BooleanField(default=True, help_text="Off: new checkpoints get no plan.")
+
+    class Meta:
+        ordering = ("name",)
+
+    def __str__(self) -> str:
+        return self.name
+
+    def policy_for(self, facts: Mapping[str, str]) -> dict[str, Any]:
+        """Return the policy table of a checkpoint with these values of `name` and `digest`."""
+        filled: dict[str, Any] = _fill(self.policy, facts)
+        return filled
+
+    def clean(self) -> None:
+        """Raise ValidationError unless the plan has the arm, the station is simulated, and the policy is valid."""
+        if self.plan_id and self.arm_id and not self.plan.checkpoints.filter(pk=self.arm_id).exists():
+            names = ", ".join(self.plan.checkpoints.values_list("name", flat=True)) or "none"
+            raise ValidationError({"arm": f"{self.arm} is no checkpoint of {self.plan}; allowed: {names}"})
+        if self.station is not None and not self.station.simulated:
+            raise ValidationError(
+                {"station": f"{self.station} has a real robot; allowed: a simulated station"}
+            )
+        try:
+            check_policy(self.policy_for({"name": "a", "digest": "b"}))
+        except ValidationError as invalid:
+            raise ValidationError({"policy": invalid.messages}) from None
+
+
+def _fill(value: Any, facts: Mapping[str, str]) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _fill(part, facts) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_fill(part, facts) for part in value]
+    if isinstance(value, str):
+        for name, text in facts.items():
+            value = value.replace(f"{{{name}}}", quote(text) if "://" in value else text)
+    return value
+
+
+class TemplateUse(models.Model):
+    """Plan that was made by a template for a checkpoint."""
+
+    template = models.ForeignKey(PlanTemplate, on_delete=models.CASCADE, related_name="uses")
+    checkpoint = models.ForeignKey(Checkpoint, on_delete=models.PROTECT, related_name="+")
+    plan = models.OneToOneField(Plan, on_delete=models.CASCADE, related_name="template_use")
+    at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("-pk",)
+        constraints = [
+            models.UniqueConstraint(fields=("template", "checkpoint"), name="template_once_per_checkpoint")
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.checkpoint}: {self.plan}"

@@ -27,6 +27,7 @@ from evaweb.plans.counting import fails_by
 from evaweb.plans.design import (
     CROSSED_EVENT,
     ENDED_EVENT,
+    crossed_while_waiting,
     dropped_of,
     end_at_request,
     end_reason,
@@ -42,7 +43,7 @@ from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import new_key
 from evaweb.plans.selectors import handout_of, remaining
 from evaweb.trials.lifecycle import OPEN_STATES
-from evaweb.trials.models import Evaluation, Trial, TrialStatus
+from evaweb.trials.models import Checkpoint, Evaluation, Trial, TrialStatus
 from evaweb.trials.services import register_settled
 from evaweb.trials.voids import lapse_void_requests, open_void_requests
 from runtime.core.sentences import Pattern, fixed
@@ -144,6 +145,20 @@ def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> 
     _keep(plan)
     _log(plan, user, ADDITION, "drafted")
     return plan
+
+
+def copy_design(*, plan: Plan, title: str, replaced: Mapping[int, Checkpoint]) -> Plan:
+    """Create a draft with the design and the owner of a plan; `replaced` are checkpoints in place of some, by id."""
+    copied = {name: getattr(plan, name) for name in _COPIED if name not in ("name", "title")}
+    fields = {
+        name: replaced.get(getattr(plan, f"{name}_id"), getattr(plan, name)) for name in ("first", "second")
+    }
+    draft = Plan(**copied, **fields, name=_free_name(title), title=title, owner=plan.owner)
+    _keep(draft)
+    draft.positions.set(plan.positions.all())
+    draft.stations.set(plan.stations.all())
+    draft.checkpoints.set([replaced.get(row.pk, row) for row in plan.checkpoints.all()])
+    return draft
 
 
 def require_drafter(user: User) -> None:
@@ -394,7 +409,8 @@ def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
     if asked and not ended and result.ended == "boundary":
         # A refused void restores its trial; until it is answered, the result must not change.
         ended = "" if waits else end_reason(locked, result)
-        _note(locked, user, CROSSED_EVENT if waits else ENDED_EVENT, end_reason(locked, result))
+        if not (waits and noted_end(locked)):
+            _note(locked, user, CROSSED_EVENT if waits else ENDED_EVENT, end_reason(locked, result))
     if not (ended or result.ended) or waits or _unfinished(locked):
         return
     over = bool(ended) or not remaining(locked, dropped_of(locked))
@@ -403,6 +419,12 @@ def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
         if not ended:
             _note(locked, user, ENDED_EVENT, reason)
         _close(locked, user, reason)
+
+
+def noted_end(plan: Plan) -> str:
+    """Return the recorded reason for which no further trial is handed out; "" if there is none."""
+    waits = open_void_requests(_trials(plan)).order_by("pk").first()
+    return end_at_request(plan) or (crossed_while_waiting(plan, waits.at) if waits else "")
 
 
 def _on_trial_settled(trial: Trial, user: User) -> None:

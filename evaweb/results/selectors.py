@@ -240,7 +240,8 @@ def _whole(name: str, value: str) -> int:
 def station_activity() -> list[StationActivity]:
     """Return every active station with its unfinished trial."""
     stations = list(Station.objects.filter(active=True).order_by("name"))
-    open_ones = Trial.objects.filter(station__in=stations, status__in=UNFINISHED).select_related(
+    at_station = Trial.objects.filter(station__in=stations, worker=None)  # not at copies of it
+    open_ones = at_station.filter(status__in=UNFINISHED).select_related(
         "scene", "position", "checkpoint", "evaluation", "operator", "handout__plan"
     )
     by_station = {trial.station_id: trial for trial in open_ones.order_by("pk")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 from django.http import HttpRequest
@@ -42,8 +43,12 @@ from runtime.benches.schema import (
 def _size(thing: Box | Disc, *, coloured: bool) -> dict[str, Any]:
     """Return how an object of the simulated bench is drawn from above: lengths in m.
 
-    Its own colour is drawn if `coloured`.
+    Its own colours are drawn if `coloured`.
     """
+
+    def shade(colour: Sequence[int]) -> str:
+        return "#{:02x}{:02x}{:02x}".format(*colour) if coloured else ""
+
     width, depth = thing.size[:2] if isinstance(thing, Box) else (2 * thing.radius, 2 * thing.radius)
     return {
         "title": thing.title,
@@ -51,7 +56,8 @@ def _size(thing: Box | Disc, *, coloured: bool) -> dict[str, Any]:
         "width": width,
         "depth": depth,
         "example": thing.example,
-        "colour": "#{:02x}{:02x}{:02x}".format(*thing.colour) if coloured else "",
+        "colour": shade(thing.colour),
+        "rim": shade(thing.rim_colour) if isinstance(thing, Disc) else "",
     }
 
 

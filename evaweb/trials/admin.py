@@ -308,12 +308,21 @@ class CheckpointForm(forms.ModelForm):
             "parent",
             "recipe",
             "training_set",
+            "training_run",
             "tags",
             "policy",
             "strategy",
             "anchor",
             "active",
         )
+
+    training_run = forms.URLField(
+        required=False,
+        max_length=500,
+        empty_value=None,
+        assume_scheme="https",
+        help_text=Checkpoint._meta.get_field("training_run").help_text,
+    )
 
     tags = forms.CharField(required=False, help_text="Words, with commas between them: to find it by.")
 

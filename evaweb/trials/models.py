@@ -250,6 +250,14 @@ class Checkpoint(models.Model):
         verbose_name="training set",
         help_text="The subset of this lab's episodes that it was trained on.",
     )
+    training_run = (
+        models.URLField(  # NULL in place of "": SQLite adds such a column without rebuilding the table
+            max_length=500,
+            null=True,
+            blank=True,
+            help_text="Address of the page where its training is recorded, with https:// or http://.",
+        )
+    )
     tags = models.JSONField(default=list, blank=True, validators=[check_tags], help_text="To find it by.")
     policy = models.JSONField(
         default=dict,

@@ -138,9 +138,11 @@ def evaluation_list() -> QuerySet[Evaluation]:
 def trial_open(station: Station, worker: str | None = None) -> Trial | None:
     """Return the unfinished trial of the station, or of its copy `worker`.
 
-    Unfinished trials are prepared, running, paused, or ended and not scored.
+    Unfinished trials are prepared, running or paused, and at the station itself also those that ended and are not
+    scored: at copies, some are scored later, in the order of the schedule.
     """
-    unfinished = Trial.objects.filter(station=station, worker=worker, status__in=UNFINISHED).order_by("-pk")
+    states = UNFINISHED if worker is None else lifecycle.OPEN_STATES
+    unfinished = Trial.objects.filter(station=station, worker=worker, status__in=states).order_by("-pk")
     return unfinished.select_related(*_NAMED).first()
 
 

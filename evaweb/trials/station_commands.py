@@ -40,6 +40,10 @@ _CHECKPOINT_OFF = Pattern(
     "trials.station_commands.checkpoint_off",
     "checkpoint {name} is switched off: choose another one",
 )
+_AT_A_COPY = Pattern(
+    "trials.station_commands.at_a_copy",
+    "trial {trial} is run at a copy of {name}, not at the station itself: no {what}",
+)
 _NOT_IN_THIS_STATE = Pattern(
     "trials.station_commands.not_in_this_state",
     "trial {trial} is {label} and cannot be {what}: {advice}; a repetition is another trial",
@@ -221,6 +225,8 @@ def _run(trial: Trial, request: Mapping[str, Any]) -> Command:
 
 
 def _require_prepared(trial: Trial, action: str, user: User) -> None:
+    if trial.worker:
+        raise Conflict(_AT_A_COPY(trial=trial.pk, what=action, name=trial.station.name))
     status = TrialStatus(_held_status(trial))
     if status is not TrialStatus.PREPARED:
         raise Conflict(

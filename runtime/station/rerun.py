@@ -15,8 +15,8 @@ from runtime.config.loader import Resolved, apply_assignments, config_digest
 from runtime.config.schema import REMOVED_BUS_KEYS
 from runtime.core.errors import ConfigurationError, RecordingError
 from runtime.core.git_revision import revision
+from runtime.core.machine import installed_versions
 from runtime.recording.files import read_json
-from runtime.station.run import installed_versions
 
 _LISTED = 8  # most runs or keys in a sentence
 _SHORT = 12  # characters of a hash that are shown

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import math
-import platform
 import time
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Any
 
 from runtime.core.git_revision import revision
+from runtime.core.machine import installed_versions, processor
 from runtime.ipc.messages import Mode
 from runtime.policies.base import PolicyInfo
 from runtime.station.spec import StationSpec
 
 _COUNTS = ("ticks", "missed", "records_lost")
-_PACKAGES = ("eva-web", "numpy", "pyarrow", "av", "pyzmq", "msgpack")
-
-
-def installed_versions() -> dict[str, str]:
-    """Return the versions of Python, of this package, and of libraries that affect runs or recordings."""
-    return {"python": platform.python_version()} | {package: version(package) for package in _PACKAGES}
 
 
 @dataclass(slots=True)
@@ -164,6 +157,7 @@ class Provenance:
             "configuration": dict(self.spec.resolved.tree),
             "configuration_hash": self.spec.resolved.digest,
             "versions": self.versions,
+            "processor": processor(),
             "git": dict(self.git),
             "asked_wall": time.time(),
         }

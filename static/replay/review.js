@@ -115,7 +115,7 @@ export class Review {
     element("flags-count").textContent = quality ? (flags.length ? t("page.review.flags", "Flags {n}", { n: flags.length }) : t("page.review.clean", "Clean")) : t("page.review.unchecked", "Unchecked");
     element("flags-count").dataset.severity = quality?.worst ?? "";
     element("segments-count").textContent = segments.length ? t("page.review.segments_n", "Segments {n}", { n: segments.length }) : t("page.review.segments", "Segments");
-    element("history-count").textContent = reviews.length ? t("page.review.notes_n", "Notes {n}", { n: reviews.length }) : t("page.review.notes", "Notes");
+    element("history-count").textContent = reviews.length ? t("page.review.reviews_n", "Reviews {n}", { n: reviews.length }) : t("page.review.reviews", "Reviews");
     element("history-covered").hidden = !covered;
     this.#annotation.show(segments);
     this.#at();

@@ -20,13 +20,13 @@ export function nameOf(key, sizes) {
 /**
  * Return the objects on the bench of a position: [{key, name, kind, round, x, y, yaw, width, depth}], in mm and degrees. `kind`
  * is "object" for those of the lab, else the key of one of the simulated bench, of which `sizes` has sizes and, where several
- * have to be told apart, `colour`.
+ * have to be told apart, `colour` and `rim`.
  */
 export function things(bench, sizes) {
   const found = [];
-  for (const [key, { round, width, depth, colour }] of Object.entries(sizes.objects)) {
+  for (const [key, { round, width, depth, colour, rim }] of Object.entries(sizes.objects)) {
     const place = bench?.[key];
-    if (place) found.push({ key, name: nameOf(key, sizes), kind: key, round, colour, yaw: round ? 0 : place[2], ...at(place), width: mm(width), depth: mm(depth) });
+    if (place) found.push({ key, name: nameOf(key, sizes), kind: key, round, colour, rim, yaw: round ? 0 : place[2], ...at(place), width: mm(width), depth: mm(depth) });
   }
   for (const [name, place] of Object.entries(bench?.objects ?? {}).sort(([a], [b]) => a.localeCompare(b))) {
     found.push({ key: `object ${name}`, name, kind: "object", round: false, yaw: place[2], ...at(place), width: mm(place[3]), depth: mm(place[4]) });
@@ -131,11 +131,12 @@ export function ground(sizes, { x, y, width, height }) {
 
 /** Return the markup of one object; `inside` is markup that moves and turns with it. */
 export function drawn(thing, { attributes = "", inside = "", words = "" } = {}) {
-  const { kind, round, colour, x, y, yaw, width, depth } = thing;
+  const { kind, round, colour, rim, x, y, yaw, width, depth } = thing;
   const fill = colour ? ` fill="${escaped(colour)}"` : "";
+  const stroke = rim ? ` stroke="${escaped(rim)}"` : "";
   const shape =
     round
-      ? `<circle class="shape"${fill} r="${n(width / 2)}"/><circle class="rim" r="${n(width / 2 - 9)}"/>`
+      ? `<circle class="shape"${fill} r="${n(width / 2)}"/><circle class="rim"${stroke} r="${n(width / 2 - 9)}"/>`
       : `<rect class="shape"${fill} x="${n(-width / 2)}" y="${n(-depth / 2)}" width="${n(width)}" height="${n(depth)}" rx="2"/><path class="ahead" d="M0 0V${n(-depth / 2)}"/>`;
   const text = words && `<text class="thing-name" x="${n(x)}" y="${n(-y + Math.max(width, depth) / 2 + 16)}">${escaped(words)}</text>`;
   return `<g class="thing thing-${look(kind, round)}" ${attributes}><g transform="translate(${n(x)} ${n(-y)}) rotate(${n(-yaw)})">${shape}${inside}</g>${text}</g>`;

@@ -36,7 +36,7 @@ def drafted(page):
     page.get_by_label("Name of the plan").fill(TITLE)
     page.get_by_label("Question").fill("Does longer training help?")
     page.get_by_role("button", name="Create the draft").click()
-    page.get_by_role("heading", name="Arms", exact=True).wait_for()
+    page.get_by_role("heading", name="Checkpoints", exact=True).wait_for()
     for name in ARMS:
         page.locator(".draft-arm", has_text=name).get_by_role("checkbox").check()
     page.get_by_role("radio", name=f"Control: {ARMS[1]}").check()
@@ -70,7 +70,7 @@ def test_a_plan_is_made_by_clicking_and_its_first_trial_is_handed_out(browser, p
     page.locator("#checks", has_text="No digest of the weights").get_by_role(
         "link", name="Change it"
     ).first.click()
-    page.get_by_role("heading", name="Arms", exact=True).wait_for()
+    page.get_by_role("heading", name="Checkpoints", exact=True).wait_for()
     page.locator(".draft-preflight .preflight").nth(1).wait_for()  # what is known of the servers of both
     page.get_by_role("navigation", name="Steps").get_by_role("link", name="Freeze").click()
     page.get_by_role("button", name="Freeze this plan").click()

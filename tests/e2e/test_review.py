@@ -73,7 +73,7 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
     keys.press("n")
     keys.type("dark <b>for a moment</b>")
     keys.press("Enter")
-    eventually(lambda: page.locator("#history-count").inner_text() == "Notes 1", "the note is kept")
+    eventually(lambda: page.locator("#history-count").inner_text() == "Reviews 1", "the note is kept")
     assert page.locator("#review-state").inner_text() == "unreviewed"
     keys.press("f")
     eventually(lambda: page.locator("#review-state").inner_text() == "fail by ann", "the verdict stands")
@@ -272,7 +272,7 @@ def test_twenty_episodes_are_reviewed_with_one_key_each(reviewer, patient, twent
             keys.press("n")
             keys.type("lets go late")
             keys.press("Enter")
-            page.locator("#history-count", has_text="Notes 1").wait_for()
+            page.locator("#history-count", has_text="Reviews 1").wait_for()
         if number == 0:
             page.select_option("#speed", "2")
             page.locator("h1").click()

@@ -82,6 +82,11 @@ class AttemptRecord:
         return self.status == TrialStatus.SCORED
 
     @property
+    def machine(self) -> str:
+        """Machine that ran a copy of a simulated station, and its kind: "" for a trial of a person."""
+        return (self.worker or "").partition(" ")[2]
+
+    @property
     def wait(self) -> float | None:
         """Time from allocation to run [s]."""
         return _seconds(self.handed_at, self.started_at)
@@ -110,6 +115,7 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Benc
         "deviations": _deviations(runs, list(given_back.values("at", "text", by_name=F("by__username")))),
         "operators": balance(runs, "operator"),
         "stations": balance(runs, "station"),
+        "machines": balance([run for run in runs if run.worker], "machine"),
         "cameras": _cameras(plan, runs),
         "bench": _bench(plan, runs, looks),
         "delays": _compared(plan, runs),
@@ -225,11 +231,11 @@ def _accepted(images: Iterable[BenchImage]) -> dict[int, tuple[float | None, str
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Return the number of trials that count, by operator or station and by checkpoint.
+    """Return the number of trials that count, by operator, station or machine and by checkpoint.
 
-    `name` is "operator" or "station". Key `uneven` of the result is the largest number of trials by which an operator
-    or station differs from a proportional share of a checkpoint's trials. Dropped checkpoints and random order alone do
-    not increase it.
+    `name` is "operator", "station" or "machine". Key `uneven` of the result is the largest number of trials by which
+    one of these differs from a proportional share of a checkpoint's trials. Dropped checkpoints and random order alone
+    do not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -249,7 +255,10 @@ def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
 
 
 def _checkpoints(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    repeats = Counter(run.checkpoint for run in runs if run.attempt > 1)
+    begun, repeats = set[int](), Counter[str]()
+    for run in runs:  # an attempt that was not needed has a number, and is none of these
+        repeats[run.checkpoint] += run.slot in begun
+        begun.add(run.slot)
     return [
         {
             **asdict(row),

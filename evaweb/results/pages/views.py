@@ -17,8 +17,6 @@ from django.views.decorators.http import require_GET, require_POST
 from evaweb.accounts.roles import Role, role_of
 from evaweb.blinding.visibility import visibility_for_request
 from evaweb.core.errors import EvaError
-from evaweb.jobs.models import JobStatus
-from evaweb.jobs.selectors import pace_of
 from evaweb.plans import copies, services
 from evaweb.plans.blinding_rules import can_unblind, record_unblinding
 from evaweb.plans.counting import declared_failures
@@ -48,7 +46,6 @@ from evaweb.trials.voids import open_void_requests
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
 MOST_LINES = 200  # lines per list on the integrity page; REST and the report have all
-_MOST_COPIES = 64
 _FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
 MOST_PICTURES = (
     32_000_000  # [bytes] of images in a report that is packed in memory; the command has no such limit
@@ -252,8 +249,10 @@ def plan_action(request: HttpRequest, name: str, version: int, what: str) -> Htt
 def _carry_out(request: HttpRequest, plan: Plan) -> object:
     """Start the trials of a plan at copies of a simulated station."""
     typed = request.POST.get("count", "")
-    if not typed.isascii() or not typed.isdecimal() or not 1 <= int(typed[:4]) <= _MOST_COPIES:
-        raise EvaError(f"copies = {typed!r:.40}; allowed: 1 to {_MOST_COPIES}")
+    if not (
+        typed.isascii() and typed.isdecimal() and len(typed) <= 4 and 1 <= int(typed) <= copies.MOST_COPIES
+    ):
+        raise EvaError(f"copies = {typed!r:.40}; allowed: 1 to {copies.MOST_COPIES}")
     station = station_get(name=request.POST.get("station", ""))
     user: Any = request.user
     return copies.request_trials(user=user, plan=plan, station=station, count=int(typed))
@@ -264,14 +263,7 @@ def _copies(request: HttpRequest, plan: Plan) -> dict[str, Any] | None:
     stations = copies.stations_with_copies(plan) if plan.state == PlanState.FROZEN else []
     if not stations or role_of(request.user) is Role.VIEWER:
         return None
-    job = copies.job_of(plan)
-    return {
-        "stations": stations,
-        "at_work": copies.is_at_work(job),
-        "job": job,
-        "failed": job is not None and job.status == JobStatus.FAILED and job.cancelled_by_id is None,
-        "left_s": pace_of(job).left_s if job else None,
-    }
+    return {"stations": stations, "state": copies.copies_state(plan, visibility_for_request(request))}
 
 
 def _citation_page(request: HttpRequest, cited: Citation) -> HttpResponse:

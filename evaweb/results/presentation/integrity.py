@@ -113,7 +113,11 @@ def _departures(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"{_of(len(deviations[name]), 'block')} {label}"
     if deviations["out_of_turn"]:
         yield f"{_of(len(deviations['out_of_turn']), 'trial')} handed out of turn"
-    for name in ("operators", "stations"):
+    machines = [row["name"] for row in document["machines"]["rows"]]
+    if len({name.rpartition(" ")[2] for name in machines}) > 1:
+        counts = ", ".join(f"{row['name']} {sum(row['trials'])}" for row in document["machines"]["rows"])
+        yield f"Copies ran on machines of several kinds, where the same trial may differ in its last bits: {counts}"
+    for name in ("operators", "stations", "machines"):
         if document[name]["uneven"]:
             yield f"{name.capitalize()} did not share checkpoints evenly: up to {document[name]['uneven']:g} trials off"
     if document["cameras"]["unchecked"]:

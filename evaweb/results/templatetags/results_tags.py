@@ -153,7 +153,6 @@ def field_text(name: str) -> str:
 
 
 _FIELD_WORDS = {
-    "checkpoints": "Arms",
     "challenger": "Compared with the control",
     "comparing": "Compared",
     "stopping": "Design",

@@ -18,7 +18,7 @@ from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.datasets import dataset_orders
 from evaweb.episodes.models import Episode, Subset
 from evaweb.episodes.reconcile import reconcile
-from evaweb.episodes.subsets import create_subset, subset_list, subset_uuids
+from evaweb.episodes.subsets import create_subset, remove_subset, subset_list, subset_uuids
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue
@@ -111,6 +111,28 @@ def test_an_episode_that_left_its_dataset_is_named(
     assert result["done"] is False
     assert f"such as {recordings[0]}" in result["why"]
     assert not (data / "datasets" / "clean-1").exists()
+
+
+def test_a_subset_is_removed_until_it_is_used(
+    recordings: list[str], keep: Keep, ann: User, client: Client
+) -> None:
+    client.force_login(ann)
+    keep("mine")
+    assert "Remove mine" in client.get(reverse("subset-list")).content.decode()
+    client.post(reverse("subset-remove"), {"name": "mine"})
+    assert not Subset.objects.exists()
+    assert Episode.objects.count() == 4
+    kept = keep("mine")
+    Checkpoint.objects.create(name="pi0-mine", training_set=kept)
+    assert "Remove mine" not in client.get(reverse("subset-list")).content.decode()
+    page = client.post(reverse("subset-remove"), {"name": "mine"}, follow=True).content.decode()
+    assert "is stated at a checkpoint" in page
+    Checkpoint.objects.all().delete()
+    with pytest.raises(NotAllowed):
+        remove_subset(user=person("vera", "viewer"), subset=kept)
+    Subset.objects.update(dataset="datasets/mine")
+    with pytest.raises(Conflict, match="was published"):
+        remove_subset(user=ann, subset=kept)
 
 
 def test_names_are_taken_once_and_empty_subsets_refused(recordings: list[str], keep: Keep, ann: User) -> None:

@@ -14,7 +14,7 @@ from django.utils import timezone
 from evaweb.core import lock_wait
 from evaweb.core.errors import Conflict, NotAllowed
 from evaweb.jobs import locks, services
-from evaweb.jobs.kinds import JobContext, UnknownKind
+from evaweb.jobs.kinds import JobContext, JobUnfinished, UnknownKind
 from evaweb.jobs.locks import exclusive_job
 from evaweb.jobs.models import Job, JobStatus
 from tests.evaweb.conftest import person
@@ -115,6 +115,35 @@ def test_an_error_is_kept_and_tried_again_later_until_the_last_attempt(toy: Toy)
     toy.does = lambda work: {}
     services.retry_job(user=person("olga", "operator"), job=job)
     assert services.run_queue("cpu") == 1
+
+
+def test_an_unfinished_job_is_queued_again_behind_those_that_wait_and_not_if_it_is_cancelled(
+    toy: Toy,
+) -> None:
+    def part(work: JobContext) -> dict[str, object]:
+        if len(toy.asked) < 4:
+            raise JobUnfinished
+        return {}
+
+    toy.does = part
+    job = enqueue()
+    other = services.enqueue(kind="toy", key="toy:2", args={"other": True})
+    Job.objects.filter(pk=job.pk).update(attempts=2, deaths=3, error="before")
+    assert services.run_queue("cpu") == 5
+    assert [bool(asked) for asked in toy.asked] == [False, True, False, True, False]
+    job.refresh_from_db()
+    assert (job.status, job.attempts, job.deaths, job.error) == (JobStatus.DONE, 0, 0, "")
+
+    def part_and_cancelled(work: JobContext) -> dict[str, object]:
+        services.cancel(user=person("olga", "operator"), job=again)
+        raise JobUnfinished(60.0)
+
+    toy.does = part_and_cancelled
+    again = enqueue()
+    services.run_queue("cpu")
+    again.refresh_from_db()
+    assert (again.status, again.error) == (JobStatus.FAILED, "cancelled by olga")
+    assert other.pk
 
 
 def test_a_silent_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> None:

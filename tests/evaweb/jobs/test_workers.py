@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from datetime import timedelta
 from pathlib import Path
 from uuid import UUID, uuid4
@@ -13,12 +14,13 @@ from django.test import Client
 from django.urls import reverse
 
 from evaweb.core.errors import EvaError
-from evaweb.jobs import kinds, services, workers
+from evaweb.jobs import kinds, services, tasks, worker, workers
 from evaweb.jobs.kinds import Queue
 from evaweb.jobs.models import Hold, Job, JobStatus, LabFolder, WorkerProcess
 from evaweb.jobs.workers import NO_FOLDER, NO_QUEUE, NOBODY, waiting_for
 from tests.evaweb.conftest import person
 from tests.evaweb.jobs.conftest import Toy
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = [pytest.mark.django_db, pytest.mark.usefixtures("rung")]
 
@@ -45,7 +47,7 @@ def test_a_job_goes_into_the_queue_of_its_kind_which_is_one_that_workers_take() 
     assert {name: kind.queue for name, kind in kinds._kinds.items() if kind.queue != Queue.CPU} == {
         "judge": "gpu",
         "preflight": "station",
-        "copies": "station",
+        "copies": "copies",
     }
     assert kinds.without_folder() == ["preflight"]
     assert enqueue("preflight").queue == "station"
@@ -54,12 +56,34 @@ def test_a_job_goes_into_the_queue_of_its_kind_which_is_one_that_workers_take() 
 
 @pytest.mark.parametrize("given", ["", ",", "lab", "cpu,,disk", "CPU"])
 def test_a_queue_that_no_job_is_in_is_refused(given: str) -> None:
-    with pytest.raises(CommandError, match="allowed: cpu, gpu, station"):
+    with pytest.raises(CommandError, match="allowed: cpu, gpu, station, copies"):
         call_command("worker", queues=given)
 
 
 def test_queues_are_named_once_each() -> None:
     assert workers.queue_names(" station,cpu, station") == ["cpu", "station"]
+
+
+@pytest.mark.django_db(transaction=True)
+def test_jobs_at_copies_run_beside_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    both, ending = threading.Barrier(2, timeout=PATIENCE_S), threading.Event()
+
+    def meet(work: kinds.JobContext) -> dict[str, object]:
+        return {"met": both.wait() >= 0}
+
+    monkeypatch.setitem(kinds._kinds, "copy", kinds.Declared(meet, queue=Queue.COPIES))
+    threads = [threading.Thread(target=worker._work_on_copies, args=(ending,)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for number in range(2):
+        services.enqueue(kind="copy", key=f"copy:{number}", args={})
+    tasks.work(Queue.COPIES)
+    eventually(lambda: Job.objects.filter(result={"met": True}).count() == 2, "both are done")
+    ending.set()
+    worker.wake_copies()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
 
 
 # --- jobs that no running worker can take --------------------------------------------------------------------

@@ -1,8 +1,9 @@
 import json
 
 from runtime.core.git_revision import revision
+from runtime.core.machine import installed_versions
 from runtime.recording.files import to_json
-from runtime.station.run import Provenance, Run, installed_versions
+from runtime.station.run import Provenance, Run
 from tests.runtime.lockstep_station import stubbed
 
 BEGUN = {"ticks": 900, "missed": 2, "records_lost": 1, "lateness_p99_ms": 0.4}

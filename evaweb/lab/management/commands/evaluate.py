@@ -1,9 +1,9 @@
 """`python manage.py evaluate PLAN`: carries out a frozen plan at a simulated station, without people.
 
-With --copies it starts copies of the station, each for one trial on a virtual clock, on the machine of the lab's data
-folder. Otherwise it takes the lease of the station in a running lab and works as an operator does, over REST and the
-live socket. Either way the plan stays blind for it, and scores are the bench's ground truth. If it is ended and started
-again, it continues with the next trial.
+With --copies it starts copies of the station, each for one trial on a virtual clock; workers of a running lab carry out
+some of them. Otherwise it takes the lease of the station in a running lab and works as an operator does, over REST and
+the live socket. Either way the plan stays blind for it, and scores are the bench's ground truth. If it is ended and
+started again, it continues with the next trial.
 """
 
 from __future__ import annotations
