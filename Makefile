@@ -38,8 +38,8 @@ $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	@echo '2 of 5 installing what Python needs'; $(TICKING) $(call fetch,what Python needs,$(PIP) --editable .)
 	@echo '3 of 5 installing the viewer'; $(TICKING) $(call fetch,the viewer,$(PIP) --no-deps meshcat)
 	@echo '4 of 5 installing what pages need'; $(TICKING) $(call fetch,what pages need,$(call npm,ci --omit=dev))
-	@echo "5 of 5 compiling the demo robot's inverse kinematics, once for this machine; others are compiled at their first set-up"; \
-	  $(TICKING) $(PY) -m runtime.kinematics agilex_piper
+	@echo "5 of 5 compiling the renderer and the demo robot's inverse kinematics, once for this machine; other robots' at their first set-up"; \
+	  $(TICKING) $(PY) -m runtime.kinematics agilex_piper && $(PY) -m runtime.simulation.render
 	@touch $@
 
 setup-dev: $(VENV)/.setup-dev ## the same with what tests and linters need

@@ -93,23 +93,10 @@ class CompiledKinematics(Kinematics):
         )
 
     def warm_up(self) -> None:
-        """Load all kernels, and compile those that are not cached, so that no command waits for it.
-
-        A cached kernel that cannot be read (a full disk, a power failure) is compiled again.
-        """
+        """Load all kernels, and compile those that are not cached, so that no command waits for it."""
         if not kernel_cache.is_compiled(self._robot):
             _log.info("compiling the kinematics for this processor, once; this takes some seconds")
-        try:
-            self._solve_once()
-        except Exception as error:
-            if not kernel_cache.forget():
-                raise
-            _log.warning(
-                "compiled kinematics cannot be used as they are kept (%s: %s); compiling them again",
-                type(error).__name__,
-                error,
-            )
-            self._solve_once()
+        kernel_cache.load(self._solve_once)
         kernel_cache.note_compiled(self._robot)
 
     def _solve_once(self) -> None:

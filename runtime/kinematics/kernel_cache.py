@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import tempfile
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -62,6 +63,24 @@ def note_compiled(robot: Robot) -> None:
         part = cache / f"{_name(robot)}.{os.getpid()}"
         part.write_text(json.dumps(_kernels(cache)), "utf-8")
         part.replace(cache / _name(robot))
+
+
+def load(call: Callable[[], object]) -> None:
+    """Load kernels by a call of them, which compiles those that are not cached.
+
+    A cached kernel that cannot be read (a full disk, a power failure) is compiled again.
+    """
+    try:
+        call()
+    except Exception as error:
+        if not forget():
+            raise
+        logging.getLogger(__name__).warning(
+            "compiled kernels cannot be used as they are kept (%s: %s); compiling them again",
+            type(error).__name__,
+            error,
+        )
+        call()
 
 
 def forget() -> bool:

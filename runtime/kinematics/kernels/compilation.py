@@ -24,14 +24,30 @@ def kernel(loop: Loop) -> Loop:
     The loop is compiled at its first call with each combination of argument types. The result is cached on disk if
     there is a writable folder for the cache.
     """
-    compiled = numba.njit(cache=CACHE is not None, nogil=True, fastmath=_FAST, error_model="numpy")(loop)
-    return cast(Loop, compiled)
+    return _compile(loop, fastmath=_FAST, cache=CACHE is not None)
 
 
 def device_function(function: Loop) -> Loop:
     """Compile a function that is inlined into kernels."""
-    compiled = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)(function)
-    return cast(Loop, compiled)
+    return _compile(function, fastmath=_FAST, forceinline=True)
+
+
+def exact_kernel(loop: Loop) -> Loop:
+    """Return the compiled form of a loop as `kernel` does, with each floating-point operation as it is written.
+
+    It cannot create arrays, and therefore does not count references to those that it is given: in a loop over pixels
+    this would be most of the work.
+    """
+    return _compile(loop, cache=CACHE is not None, _nrt=False)
+
+
+def exact_function(function: Loop) -> Loop:
+    """Compile a function that is inlined into exact kernels."""
+    return _compile(function, forceinline=True, _nrt=False)
+
+
+def _compile(function: Loop, **options: Any) -> Loop:
+    return cast(Loop, numba.njit(nogil=True, error_model="numpy", **options)(function))
 
 
 CACHE = kernel_cache.folder()

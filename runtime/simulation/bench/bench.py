@@ -11,6 +11,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -171,6 +172,11 @@ class PinholeCamera:
     height: int
     pose: Float64
 
+    @property
+    def lens(self) -> Float64:
+        """Matrix [3, 3] from camera axes to homogeneous pixels, whose third number is the depth [m]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
     def project(self, points: Float64) -> Float64:
         """Return the pixels [..., 2] of world points [..., 3]; NaN for points that are not in front of the camera."""
         inside = (np.asarray(points, np.float64) - self.pose[:3, 3]) @ self.pose[:3, :3]
@@ -248,7 +254,7 @@ def overhead_camera(
     width: int, height: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> PinholeCamera:
     """Return the camera above the bench, moved by `shift` [m] without a turn; arms reach into its image from below."""
-    pose = _looking(_OVERHEAD_EYE, _OVERHEAD_AIM, up=(0.0, 1.0, 0.0))
+    pose = _looking(_OVERHEAD_EYE, _OVERHEAD_AIM, up=(0.0, 1.0, 0.0)).copy()
     pose[:3, 3] += shift
     return _camera(pose, _OVERHEAD_FOCAL, width, height)
 
@@ -266,6 +272,7 @@ def _camera(pose: Float64, focal: float, width: int, height: int) -> PinholeCame
     return PinholeCamera(focal * width, focal * width, (width - 1) / 2, (height - 1) / 2, width, height, pose)
 
 
+@lru_cache(maxsize=64)  # cache: a function of numbers, which have few values
 def _looking(eye: tuple[float, ...], aim: tuple[float, ...], up: tuple[float, ...]) -> Float64:
     """Return a camera frame [4, 4] at `eye` that is aimed at `aim`, with `up` towards the top of its image."""
     ahead = np.subtract(aim, eye) / math.dist(aim, eye)
@@ -274,4 +281,5 @@ def _looking(eye: tuple[float, ...], aim: tuple[float, ...], up: tuple[float, ..
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
     pose[:3, 3] = eye
+    pose.setflags(write=False)
     return pose
