@@ -203,6 +203,12 @@ def pass_time(gate, clock, seconds):
 
 
 def test_a_station_that_says_nothing_is_lost_within_its_time(gate, played, clock, tmp_path):
+    def heard():  # it is linked by the first words of both connections, however long ago those of one were
+        played.beat()
+        pass_time(gate, clock, 0)
+        return all(line.heard_at == clock.now for line in gate._remotes[STATION].lines.values())
+
+    eventually(heard, "both connections")
     pass_time(gate, clock, LOST_S - 0.01)
     assert gate.linked() == {STATION}
     pass_time(gate, clock, 0.06)
