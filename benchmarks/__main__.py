@@ -26,6 +26,7 @@ _BENCHMARKS = (
     "moving_target",
     "pages",
     "partial_credit",
+    "peers_sim",
     "recording",
     "replay",
     "results",
@@ -36,7 +37,7 @@ _BENCHMARKS = (
 )
 _SETTABLE = ("latency", "loop")
 _SEEDED = ("chaos",)
-_LONG = ("chaos", "designs", "recording", "results")
+_LONG = ("chaos", "designs", "peers_sim", "recording", "results")
 _SECONDS = 20.0
 
 

@@ -22,7 +22,7 @@ from runtime.simulation.bench.bench import BenchState, camera_arm
 from runtime.simulation.bench.block_table import ResetRequest
 from runtime.simulation.bench.conveyor import CONVEYOR, Conveyor
 from runtime.simulation.bench.plant import Plant
-from runtime.simulation.environments import Environment
+from runtime.simulation.environment import Environment
 from runtime.simulation.node import parser
 from runtime.simulation.render import Renderer
 from runtime.simulation.scripts.chase import ChaseScript, PlaceMap

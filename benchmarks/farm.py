@@ -1,7 +1,8 @@
 """Trials at simulated benches in processes of their own: speed, throughput of one and of two workers, and agreement.
 
-Each trial is `python -m runtime.standins.trial`: node, bench with contact forces, policy server and station in one
-process, with recording. The policy is scripted and answers in under a millisecond, so that servers are no part of this.
+Each trial is `runtime.standins.trial` in a process of its own, started as copies of a station are: node, bench with
+contact forces, policy server and station in one process, with recording. The policy is scripted and answers in under a
+millisecond, so that servers are no part of this.
 
 * `speed_ratio.2_cameras`, `speed_ratio.3_cameras`: the run's time over the time that it took, for pictures of 224x224;
   all cameras of the robot are drawn, shown to the policy, encoded and recorded.
@@ -15,9 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -26,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Figure, Report
+from evaweb.plans.trial_processes import TrialProcesses
 from runtime.recording.reader import open_episode
 
-_ROOT = Path(__file__).parents[1]
 _TRIALS = 8
 _SMALL = (224, 224)
 _CASES = {  # name -> deployment, robot, size of the pictures
@@ -36,7 +34,9 @@ _CASES = {  # name -> deployment, robot, size of the pictures
     "3_cameras": ("tabletop", "agilex_piper", _SMALL),
     "640x480": ("tabletop", "agilex_piper", (640, 480)),
 }
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+_PROCESSES = TrialProcesses(
+    dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+)
 
 
 def measure(seconds: float) -> Report:
@@ -88,19 +88,27 @@ def _trial(folder: Path, case: str, seed: int, seconds: float) -> Mapping[str, A
         "run": {"mode": "continuous", "duration_s": seconds, "trial": {}},
     }
     sets = [f'data_dir="{folder}"', "recording.min_free_bytes=0"]
-    command = [sys.executable, "-m", "runtime.standins.trial", f"deployments/{deployment}.toml"]
-    command += [part for assignment in sets for part in ("--set", assignment)]
-    command += ["--serve", f"openpi --robot {robot} --port 0", "--width", str(width), "--height", str(height)]
-    done = subprocess.run(
-        command,
-        cwd=_ROOT,
-        env=os.environ | _ONE_THREAD,
-        input=json.dumps(orders),
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
-    result: Mapping[str, Any] = json.loads(done.stdout)
+    arguments = [f"deployments/{deployment}.toml", "--lifeline"]
+    arguments += [part for assignment in sets for part in ("--set", assignment)]
+    arguments += [
+        "--serve",
+        f"openpi --robot {robot} --port 0",
+        "--width",
+        str(width),
+        "--height",
+        str(height),
+    ]
+    folder.mkdir(parents=True)
+    process = _PROCESSES.start(arguments, folder / "log")
+    try:
+        process.input.write(json.dumps(orders).encode() + b"\n")
+        process.input.flush()
+        answer, code = process.output.read(), process.wait()
+    finally:
+        process.close()
+    if code:
+        raise RuntimeError(f"a trial ended with {code}: {(folder / 'log').read_text()[-500:]}")
+    result: Mapping[str, Any] = json.loads(answer)
     return result
 
 

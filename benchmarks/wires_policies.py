@@ -77,6 +77,10 @@ def protocols(robot: Robot) -> list[Protocol]:
             ("--externals", "2"),
         ),
         Protocol("starvla", {"cameras": keys}),
+        Protocol(
+            "xpolicylab",
+            {"cameras": dict(zip(keys, ("cam_head", "cam_left_wrist", "cam_right_wrist"), strict=True))},
+        ),
         Protocol("gr00t", {"video": pictures, "state": places, "actions": places}),
         Protocol(
             "lerobot",

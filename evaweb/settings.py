@@ -34,6 +34,7 @@ INSTALLED_APPS = [
     "axes",
     "csp",
     "channels",
+    "evaweb.accounts",
     "evaweb.stations",
     "evaweb.jobs",
     "evaweb.episodes",

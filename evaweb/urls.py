@@ -8,6 +8,7 @@ from django.contrib.auth.decorators import login_not_required
 from django.http import HttpRequest, HttpResponse
 from django.urls import include, path
 
+from evaweb.accounts.account_page import account
 from evaweb.accounts.password_change import OwnPasswordView
 from evaweb.api.urls import urls as rest
 from evaweb.lab import first_account
@@ -31,6 +32,7 @@ urlpatterns = [
         name="login",
     ),
     path("logout/", auth_views.LogoutView.as_view(), name="logout"),
+    path("account/", account, name="account"),
     path("password/", OwnPasswordView.as_view(), name="password"),
     path("admin/", admin.site.urls),
     path("api/v1/", rest),

@@ -4,7 +4,7 @@ from robots.body import Body
 from robots.chain import Chain
 from robots.errors import RobotError
 from robots.grippers import GripperChoice
-from robots.loading import load_robot, load_robot_with_optional_groups, robot_names
+from robots.loading import is_described, load_robot, load_robot_with_optional_groups, robot_names
 from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
 from robots.visuals import RobotScene, Visual, scene_of
 
@@ -20,6 +20,7 @@ __all__ = [
     "RobotError",
     "RobotScene",
     "Visual",
+    "is_described",
     "load_robot",
     "load_robot_with_optional_groups",
     "robot_names",

@@ -25,12 +25,18 @@ from robots.rotations import Float64
 from robots.urdf import Urdf
 
 _HERE = Path(__file__).resolve().parent
+_OF_BENCHES = _HERE.parent / "runtime" / "benches"  # robots of benchmarks, in the folders of their benches
 _FILE = "robot.toml"
 
 
 def robot_names() -> tuple[str, ...]:
     """Return the names of the included robots, and of those in the folders of $EVA_ROBOTS (a search path)."""
-    return tuple(sorted(_find_folders()))
+    return tuple(sorted(_find_folders(_HERE, *robot_folders())))
+
+
+def is_described(name: str) -> bool:
+    """Return True for the name of a robot that can be loaded: one of `robot_names`, or a bench's own robot."""
+    return name in _find_folders()
 
 
 def robot_folders() -> tuple[Path, ...]:
@@ -39,10 +45,13 @@ def robot_folders() -> tuple[Path, ...]:
     return tuple(Path(part).expanduser() for part in parts if part)
 
 
-def _find_folders() -> dict[str, Path]:
-    """Return the folders of all robots by name; an included robot cannot be replaced by another of the same name."""
+def _find_folders(*roots: Path) -> dict[str, Path]:
+    """Return the folders of robots by name; an included robot cannot be replaced by another of the same name.
+
+    They are searched below `roots`; by default below all, with those of benches, which exist on their bench alone.
+    """
     folders: dict[str, Path] = {}
-    for root in (_HERE, *robot_folders()):
+    for root in roots or (_HERE, _OF_BENCHES, *robot_folders()):
         for file in sorted(root.glob(f"*/{_FILE}")):
             folders.setdefault(file.parent.name, file.parent.resolve())
     return folders

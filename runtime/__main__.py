@@ -18,7 +18,7 @@ from runtime.config.loader import Resolved
 from runtime.core import environment
 from runtime.core import logs as log
 from runtime.core.clock import MonotonicClock
-from runtime.core.errors import ConfigurationError, RuntimeFault
+from runtime.core.errors import ConfigurationError, RuntimeFault, SetupError
 from runtime.ipc.lifeline import Lifeline
 from runtime.processes.coordinator.builders import make_policy
 from runtime.processes.supervisor.supervisor import Supervisor
@@ -56,6 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _check(spec)
         if options.lockstep:
             return run_in_lockstep(spec)
+        if spec.deployment.lockstep.benchmark:
+            raise SetupError(
+                "lockstep.benchmark = true: a station in real time does not wait for its policy; allowed: "
+                "python -m runtime.standins.lockstep, or lockstep.benchmark = false"
+            )
         return Supervisor(spec, Lifeline() if options.lifeline else None).run(options.headless)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)

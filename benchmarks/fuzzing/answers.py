@@ -20,6 +20,7 @@ from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
 from runtime.standins.websocket_server import Frames, WebsocketServer
+from runtime.standins.xpolicylab_server import XpolicylabBehaviour, XpolicylabServer
 
 _QUESTIONS = 12
 _SIZE = (24, 32)  # of images
@@ -51,6 +52,11 @@ _PROTOCOLS = (
         "starvla",
         lambda: StarvlaServer(_ROBOT, StarvlaBehaviour(size=_SIZE)),
         {"cameras": _VIEWS, "ping_every": 0},
+    ),
+    Protocol(
+        "xpolicylab",
+        lambda: XpolicylabServer(_ROBOT, XpolicylabBehaviour()),
+        {"cameras": {"cam_high": "cam_head"}, "heartbeat_every": 0},
     ),
 )
 

@@ -15,6 +15,7 @@ from ninja.errors import AuthenticationError, HttpError, ValidationError, Valida
 from evaweb.api import (
     accounts,
     checkpoints,
+    crates,
     datasets,
     episodes,
     failures,
@@ -87,6 +88,7 @@ api.add_router("/templates", templates.router)
 api.add_router("/preflights", preflights.router)
 api.add_router("", sessions.router)
 api.add_router("", results.router)
+api.add_router("/crates", crates.router)
 api.add_router("/jobs", jobs.router)
 api.add_router("/find", find.router)
 

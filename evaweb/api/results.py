@@ -21,6 +21,8 @@ from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.json_forms import write_proportion
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.analysis.simulated import compare_with_real, simulated_plans
+from evaweb.results.crates.download import crate_response
+from evaweb.results.crates.options import CrateOptions
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.presentation.citation import citation
 from evaweb.results.presentation.plan_result import PlanResult
@@ -171,6 +173,17 @@ class ScoreRow(Schema):
         }
 
 
+class CrateQuery(Schema):
+    """Licence of a crate, an SPDX identifier, and texts in place of those that follow from the plan."""
+
+    license: str
+    name: str = ""
+    description: str = ""
+    lab: str = ""
+    date: str = ""
+    videos: bool = False
+
+
 class PlannerIn(Schema):
     """Wanted difference and available time, as on the planner's page."""
 
@@ -267,6 +280,22 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
         }
         for pair in matched
     ]
+
+
+@router.get(
+    _PLAN + "/crate",
+    response={200: None, **FAILURES},
+    summary="The results as an RO-Crate",
+    url_name="plan-crate",
+)
+def crate(request: HttpRequest, name: str, version: int, options: Query[CrateQuery]) -> Any:
+    """Return a zip with the report, the data, the program that recomputes them, and their metadata as RO-Crate 1.3.
+
+    With `videos` it has the videos of the trials that count too. `date` is the day of publication.
+    """
+    user: Any = request.auth  # type: ignore[attr-defined]
+    plan = plan_get(name=name, version=version)
+    return crate_response(request, user, plan, CrateOptions(**options.model_dump()))
 
 
 @router.get(

@@ -27,13 +27,17 @@ from evaweb.accounts.roles import Role
 from evaweb.console.early_refusals import is_stop, raw_refusal, refusal
 from evaweb.console.viewers import current_role
 from evaweb.plans.references import LARGEST
+from evaweb.results.crates.limits import MOST_UPLOAD
 from evaweb.serving.body_limits import body_limit_for
 from runtime.ipc import estop_requests as pressing
 
 log = logging.getLogger(__name__)
 ANONYMOUS_LIMIT = 64 * 1024  # [bytes] a login, or an e-stop press
 USER_LIMIT = 2 * 1024 * 1024  # [bytes] a form; for REST see `body_limit_for`
-_UPLOADS = {b"/admin/plans/plan/import/": LARGEST + ANONYMOUS_LIMIT}  # files from administrators
+_UPLOADS = {  # files from administrators
+    b"/admin/plans/plan/import/": LARGEST + ANONYMOUS_LIMIT,
+    b"/result/crates/import": MOST_UPLOAD + ANONYMOUS_LIMIT,
+}
 _ESTOP = re.compile(rb"/api/v1/stations/[^/]+/estop")
 _REST = b"/api/"
 _LINGER_S = (

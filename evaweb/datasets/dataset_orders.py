@@ -241,7 +241,7 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
         args |= _subset_args(order)
     if isinstance(order, Delete):
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
-    if isinstance(order, Import) and order.robot and order.robot not in robots.robot_names():
+    if isinstance(order, Import) and order.robot and not robots.is_described(order.robot):
         raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
     _require_no_deletion(names)
     about = next(filter(None, [*names, args.get("to"), args.get("bag")]))

@@ -36,7 +36,7 @@ _OWN = frozenset(
         *("episodes", "previews", "arrivals", "archived", "cache", "uploads", "reveals", "exports", "labels"),
         *("mcap", "quality", "quarantine", "reviews", "scores", "sessions"),
         *("stations", "jobs", "broker", "unwritten", "pictures", "logs", "static", "media"),
-        *("deployments", "diagnosis", "link", "bags", "farm"),
+        *("deployments", "diagnosis", "link", "bags", "farm", "environments", "crates"),
     )
 )
 

@@ -143,7 +143,7 @@ def load_played_episode(name: str, index: int, robot: str = "") -> PlayedEpisode
     listed = next((entry for entry in dataset.episodes if entry.index == index), None)
     if listed is None:
         raise NotFound(_HAS_NO_EPISODE_THERE(name=name, index=index, count=len(dataset.episodes)))
-    if robot and robot not in robots.robot_names():
+    if robot and not robots.is_described(robot):
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     own = str(dataset.info.get("robot_type") or "")
     return PlayedEpisode(

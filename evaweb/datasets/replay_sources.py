@@ -101,7 +101,7 @@ def dataset_address(route: str, episode: PlayedEpisode, *more: Any) -> str:
 
 def dataset_config(episode: PlayedEpisode) -> dict[str, Any]:
     """Return the settings of the page's modules, in the form of evaweb.episodes.views.replay_config."""
-    is_described = episode.robot in robots.robot_names()
+    is_described = robots.is_described(episode.robot)
     videos = []
     for camera in episode.cameras:
         span = episode.video(camera)

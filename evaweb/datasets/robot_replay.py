@@ -88,7 +88,7 @@ class PlayableEpisode:
             return reverse("replay", args=[self.source])
         name, _, index = self.source.rpartition(":")
         path = reverse("dataset-replay", args=[name, int(index)])
-        has_chosen_robot = not self.ours and self.robot in robots.robot_names()
+        has_chosen_robot = not self.ours and robots.is_described(self.robot)
         return f"{path}?{urlencode({'robot': self.robot})}" if has_chosen_robot else path
 
 
@@ -279,7 +279,7 @@ def _differences(recorded: PlayableEpisode, facts: Mapping[str, Any], space: str
     """Return all differences between the episode's robot and the station's; [] if there are none."""
     sentences = []
     own = str(facts.get("robot", ""))
-    if recorded.robot not in robots.robot_names():
+    if not robots.is_described(recorded.robot):
         called = f"calls its robot {recorded.robot!r}" if recorded.robot else "names no robot"
         return [f"the episode {called}: choose its robot on its page in Replay, then come back"]
     if recorded.robot != own:

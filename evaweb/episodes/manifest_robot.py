@@ -52,7 +52,7 @@ def robot_for(manifest: Mapping[str, Any]) -> robots.Robot:
     Raises: NotFound if it is not described any more, or its joints differ from the recorded ones.
     """
     name, groups = str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest)
-    if name not in robots.robot_names():
+    if not robots.is_described(name):
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.robot_names())))
     try:
         robot = robots.load_robot(name, groups)

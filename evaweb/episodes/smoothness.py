@@ -64,6 +64,8 @@ def smoothness_of(episode: Episode) -> Smoothness:
         robot = robot_for(episode.manifest)
     except NotFound as error:
         return _none(str(error))
+    if not robot.arms:
+        return _none(f"{robot.name} has no arm whose end effector has a known place")
     rate = episode.manifest.get("control_rate")
     if not isinstance(rate, int | float) or rate < 2 * CUT_OFF:
         return _none(

@@ -134,6 +134,7 @@ def _export_asked(request: HttpRequest, episode: Episode, format: str) -> HttpRe
 def export_state(request: HttpRequest, uuid: UUID, format: str) -> HttpResponse:
     """Show the state of an exported file, as a fragment of a page that polls."""
     episode = episode_get(uuid=uuid)
+    visibility_for_request(request).require_episode(episode)  # its size depends on what is hidden
     context = {"episode": episode, "export": export_of(episode=episode, wanted=export_format(format))}
     return render(request, "episodes/export.html", context)
 
@@ -171,7 +172,7 @@ def replay_config(episode: Episode) -> dict[str, Any]:
         }
         for camera in episode.cameras
     ]
-    if episode.kind == IMPORTED and episode.robot not in robots.robot_names():
+    if episode.kind == IMPORTED and not robots.is_described(episode.robot):
         called = f"calls its robot {episode.robot}" if episode.robot else "names no robot"
         address |= {"geometry": "", "why": f"the dataset {called}: import it with --robot"}
     grid = asdict(Grid.of(episode.frames))

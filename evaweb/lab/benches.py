@@ -11,6 +11,7 @@ from django.conf import settings
 from evaweb.lab import programs
 from evaweb.lab.demo_rows import station_registered
 from evaweb.lab.processes import LabError, ProgramSpec
+from evaweb.plans import copies
 from runtime.config.loader import ConfigurationError, load
 
 
@@ -18,12 +19,14 @@ from runtime.config.loader import ConfigurationError, load
 class Bench:
     """Station of this lab: its deployment file, and assignments that override values in it.
 
-    If `runs` is set, the station is running already.
+    If `runs` is set, the station is running already. `options` are those of a simulated bench in benchmark mode, which
+    runs in the station's process.
     """
 
     deployment: Path
     assignments: Sequence[str] = ()
     runs: bool = False
+    options: Sequence[str] = ()
 
 
 def registered(bench: Bench) -> str:
@@ -46,6 +49,15 @@ def registered(bench: Bench) -> str:
 
 
 def program_of(bench: Bench) -> ProgramSpec:
-    """Return the program of a bench's runtime."""
+    """Return the program of a bench's runtime.
+
+    In benchmark mode that is a station in lockstep, no faster than life for people who watch; copies of it may carry
+    out trials.
+    """
     assignments = [f'data_dir="{settings.DATA_DIR}"', *bench.assignments]
-    return programs.station(str(bench.deployment), assignments)
+    deployment = load(bench.deployment, bench.assignments).deployment
+    if not deployment.lockstep.benchmark:
+        return programs.station(str(bench.deployment), assignments)
+    path, options = str(bench.deployment), tuple(bench.options)
+    copies.write_copies(deployment.station, copies.Copies(path, assignments, options, {}))
+    return programs.lockstep(path, assignments, deployment.robot, {}, (*options, "--paced"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from django.contrib.auth.models import User
@@ -15,6 +15,7 @@ from evaweb.plans.models import Allocation, Plan, PlanState, StoppingRule
 from evaweb.plans.services import amend_plan, freeze_plan
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+from runtime.benches.schema import load_schema
 
 _ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without characters that look alike
 
@@ -114,14 +115,15 @@ def demo_plan(
     *,
     name: str,
     title: str,
+    question: str,
     owner: str,
-    scene: Scene,
+    positions: Iterable[Position],
     checkpoints: Sequence[Checkpoint],
     repetitions: int,
     design: str = StoppingRule.EVIDENCE,  # type: ignore[assignment]
     order: str = Allocation.PAIRED,  # type: ignore[assignment]
 ) -> Plan:
-    """Return a frozen blind plan that compares two checkpoints at all positions of a scene.
+    """Return a frozen blind plan that compares two checkpoints at all these positions.
 
     A plan with this name that exists already is returned instead, amended first if it is frozen and its checkpoints
     have changed since. If it is closed or revealed, it stays so.
@@ -136,7 +138,7 @@ def demo_plan(
         plan = Plan.objects.create(
             name=name,
             title=title,
-            question=f"Does {first} put the block on the plate more often than {second}?",
+            question=question,
             owner=user,
             repetitions=repetitions,
             first=first,
@@ -144,7 +146,7 @@ def demo_plan(
             stopping=design,
             allocation=order,
         )
-        plan.positions.set(scene.positions.all())
+        plan.positions.set(positions)
         plan.checkpoints.set(checkpoints)
     if plan.state == PlanState.FROZEN:
         now = {row.name: checkpoint_of(row) for row in plan.checkpoints.all()}
@@ -161,3 +163,33 @@ def demo_checkpoint(*, name: str, description: str, policy: Mapping[str, object]
         name=name, defaults=facts, create_defaults={"description": description, **facts}
     )
     return checkpoint
+
+
+@transaction.atomic
+def benchmark_scene(*, bench: str, task: str, time_limit_s: float, **choices: str) -> Scene:
+    """Return the scene of one task of a benchmark, created once; changes by an administrator are kept.
+
+    It has one position, with its `task` and further `choices`; further layouts come from the seeds of a plan's
+    repetitions. Its milestones are those that are the task's success.
+    """
+    schema = load_schema(bench)
+    scene, created = Scene.objects.get_or_create(
+        name=f"{bench}-{task}"[:60],
+        defaults={
+            "title": f"{schema.title}: {task}",
+            "instruction": task,
+            "criterion": " and ".join(schema.milestones[name].text for name in schema.success),
+            "layout": "The simulated bench lays itself out at set-up.",
+            "bench": bench,
+            "time_limit_s": time_limit_s,
+        },
+    )
+    if created:
+        Position.objects.create(
+            scene=scene, number=1, label=task, bench={"choices": {"task": task, **choices}}
+        )
+        for order, name in enumerate(schema.success, start=1):
+            Milestone.objects.create(
+                scene=scene, order=order, text=schema.milestones[name].text, required=True, truth=name
+            )
+    return scene

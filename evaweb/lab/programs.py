@@ -128,6 +128,17 @@ def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Prog
     )
 
 
+def at_bench(name: str, bench: str, file: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
+    """Return the program of a Python file of a bench, in the bench's own environment; it serves on `port`, or on a free
+    one if that is 0, which it keeps after a restart.
+    """
+
+    def arguments(port: object) -> tuple[str, ...]:
+        return ("-m", "runtime.benches.environments", bench, file, *options, "--port", str(port))
+
+    return ProgramSpec(name, arguments(port), announces=True, again=lambda found: arguments(port_of(found)))
+
+
 def lockstep(
     deployment: str,
     assignments: Sequence[str],

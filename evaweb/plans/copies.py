@@ -13,8 +13,6 @@ import json
 import os
 import platform
 import shutil
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -57,6 +55,7 @@ from evaweb.plans.frozen_document import require_checkpoints, require_scene
 from evaweb.plans.models import Handout, Plan, PlanState, StoppingRule
 from evaweb.plans.selectors import without_dropped
 from evaweb.plans.services import end_plan_if_decided, noted_end
+from evaweb.plans.trial_processes import PROCESSES
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Scene, Score, Trial, TrialStatus
@@ -65,7 +64,6 @@ from evaweb.trials.services import dismiss_trial, register_check, score_trial
 from evaweb.trials.station_commands import run_args, setup_args
 from evaweb.trials.station_events import record_whole_run
 from runtime.benches.schema import UnusableBench
-from runtime.core.environment import without_web_secrets
 from runtime.core.machine import machine_kind
 from runtime.core.sentences import Pattern
 
@@ -77,7 +75,6 @@ _WAITS_FOR_ITS_TURN = Pattern(
 FOLDER = "farm"  # below the data folder
 JOB = "copies"
 MOST_COPIES = 256  # of one plan that a person may ask for
-_PROGRAM = ("-m", "runtime.standins.trial")
 _LOOK_S = 1.0  # until a copy looks again whether others have scored the trials that come first
 _AHEAD = 2  # trials per copy that may wait for the score of an earlier one
 _POLL_S = 0.5
@@ -723,34 +720,20 @@ def _run_process(folder: Path, trial: Trial, user: User, copies: Copies) -> Mapp
         f"data_dir={json.dumps(str(folder))}",
         f"station={json.dumps(trial.station.name)}",
     ]
-    command = [sys.executable, *_PROGRAM, copies.deployment, "--lifeline"]
-    command += [*copies.options, *serving, *(part for assignment in sets for part in ("--set", assignment))]
-    with (folder / "log").open("wb") as log:
-        child = subprocess.Popen(
-            command,
-            cwd=settings.BASE_DIR,
-            env=without_web_secrets(os.environ),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-        )
-        assert child.stdin is not None
-        assert child.stdout is not None
-        try:
-            with suppress(BrokenPipeError):  # it has failed already
-                child.stdin.write(json.dumps(orders).encode() + b"\n")
-                child.stdin.flush()
-            overdue = threading.Timer(_LONGEST_S + _SLOWEST * (trial.time_limit_s or 0.0), child.kill)
-            overdue.daemon = True
-            overdue.start()
-            answer = child.stdout.read()
-            code = child.wait()
-            overdue.cancel()
-        finally:
-            with suppress(BrokenPipeError):
-                child.stdin.close()  # kills it if it is still running
-            child.stdout.close()
-            child.wait()
+    arguments = [copies.deployment, "--lifeline", *copies.options, *serving]
+    arguments += [part for assignment in sets for part in ("--set", assignment)]
+    process = PROCESSES.start(arguments, folder / "log", {"EVA_DATA_DIR": str(settings.DATA_DIR)})
+    try:
+        with suppress(BrokenPipeError):  # it has failed already
+            process.input.write(json.dumps(orders).encode() + b"\n")
+            process.input.flush()
+        overdue = threading.Timer(_LONGEST_S + _SLOWEST * (trial.time_limit_s or 0.0), process.kill)
+        overdue.daemon = True
+        overdue.start()
+        answer, code = process.output.read(), process.wait()
+        overdue.cancel()
+    finally:
+        process.close()
     if code:
         words = (folder / "log").read_text("utf-8", "replace").strip()[-_WORDS:]
         raise EvaError(

@@ -26,7 +26,7 @@ class PositionTable(Table):
     number: int = Field(ge=0, lt=2**15)
     label: str = ""
     description: str = ""
-    bench: dict[str, list[float] | dict[str, list[float] | float]] | None = None
+    bench: dict[str, list[float] | dict[str, list[float] | float | str]] | None = None
 
 
 class MilestoneTable(Table):

@@ -181,3 +181,35 @@ class Judgement(models.Model):
 
     def __str__(self) -> str:
         return f"{self.judge} ({self.version}) of trial {self.trial_id}: {self.reason or 'judged'}"
+
+
+class ImportedCrate(models.Model):
+    """Results of another lab, read-only: a crate in DATA/crates, by its digest, and what pages show of it.
+
+    None of it enters any statistic of this lab. The row of a removed crate stays without content, as the record of who
+    imported and who removed it.
+    """
+
+    sha256 = models.CharField("SHA-256", max_length=64)
+    size = models.PositiveBigIntegerField(help_text="Of the zip [bytes].")
+    content = models.JSONField(help_text="What pages show of it; see evaweb.results.crates.foreign.")
+    imported_by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    imported_at = models.DateTimeField(default=timezone.now)
+    removed_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL, null=True, on_delete=models.PROTECT, related_name="+"
+    )
+    removed_at = models.DateTimeField(null=True)
+
+    append_only = AppendOnly(
+        "the record of an imported crate is never changed or removed",
+        columns=("sha256", "size", "imported_by", "imported_at"),
+    )
+
+    class Meta:
+        ordering = ("-imported_at", "-pk")
+        constraints = [
+            models.UniqueConstraint(fields=("sha256",), condition=Q(removed_at=None), name="crate_once")
+        ]
+
+    def __str__(self) -> str:
+        return f"crate {self.sha256[:12]}"

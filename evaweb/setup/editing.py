@@ -74,6 +74,8 @@ def sizes_of(schema: BenchSchema) -> dict[str, Any]:
         "reach": schema.reach.distance,
         "objects": {name: _size(thing, coloured=coloured) for name, thing in schema.objects.items()},
         "factors": {name: factor.model_dump() for name, factor in schema.factors.items()},
+        "program": schema.program is not None,
+        "choices": {name: choice.model_dump() for name, choice in schema.choices.items()},
     }
 
 
@@ -87,7 +89,11 @@ def _drawn(scene: Scene) -> tuple[BenchSchema, dict[str, Any], str]:
         return scene.schema, sizes_of(scene.schema), ""
     except UnusableBench as error:
         schema = load_schema(DEFAULT_BENCH)
-        return schema, sizes_of(schema) | {"objects": {}, "factors": {}, "apart": []}, str(error)
+        return (
+            schema,
+            sizes_of(schema) | {"objects": {}, "factors": {}, "choices": {}, "apart": []},
+            str(error),
+        )
 
 
 # Corners of the area in 4:3 images of the simulated overhead camera, as shares of width and height: near left, near

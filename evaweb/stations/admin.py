@@ -26,7 +26,9 @@ class StationForm(forms.ModelForm):
 
     def __init__(self, *args: Any, **named: Any) -> None:
         super().__init__(*args, **named)
-        self.fields["robot"] = forms.ChoiceField(choices=[(name, name) for name in robots.robot_names()])
+        own = (self.instance.robot,) if self.instance.pk else ()  # may be the robot of a bench alone
+        names = dict.fromkeys((*robots.robot_names(), *own))
+        self.fields["robot"] = forms.ChoiceField(choices=[(name, name) for name in names])
 
 
 @admin.register(Station)

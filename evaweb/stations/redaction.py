@@ -59,7 +59,8 @@ _JOINTS = ("measured", "commanded", "simulated", "engaged", "limited", "clock")
 
 # Kinds of events whose text is shown without data; other kinds are hidden or handled in `_event`.
 _EVENTS = ("camera_back", "camera_lost", "drives", "estopped", "labelled", "released")
-_JUDGED = ("milestones", "success")  # hidden ground truth: operators score before they learn it
+# Hidden ground truth: operators score before they learn it, and the count of steps is the pace of the policy.
+_JUDGED = ("milestones", "success", "over", "steps")
 
 
 def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, Any]:

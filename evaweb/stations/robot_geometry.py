@@ -116,7 +116,7 @@ def drawn_robot(robot: str, groups: Sequence[str] | None = None) -> DrawnRobot:
 
 @lru_cache(_KEPT)
 def _drawn_robot(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot:
-    if robot not in robots.robot_names():  # the name may come from a URL: never use it as a path
+    if not robots.is_described(robot):  # the name may come from a URL: never use it as a path
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     try:
         described = robots.load_robot(robot, groups)

@@ -157,8 +157,9 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
         args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": laid}
         # Without a layout, any bench would accept the scene.
         args["bench"] |= {"of": trial.scene.bench, "schema_digest": trial.scene.bench_digest}
-        if factors := (trial.position.bench or {}).get("factors"):
-            args["bench"]["factors"] = factors
+        for key in ("factors", "choices"):
+            if asked := (trial.position.bench or {}).get(key):
+                args["bench"][key] = asked
     return args
 
 

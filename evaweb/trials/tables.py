@@ -17,7 +17,7 @@ from runtime.benches.schema import DEFAULT_BENCH, BenchSchema, UnusableBench, is
 from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
-_OTHER_KEYS = ("objects", "factors")  # keys of a layout that are no objects of a simulated bench
+_OTHER_KEYS = ("objects", "factors", "choices")  # keys of a layout that are no objects of a simulated bench
 _OBJECT_NAME = re.compile(r"[^\W_](?:[\w .-]{0,38}[\w.-])?")
 _SMALLEST, _LARGEST = 0.005, 1.0  # side of an object [m]
 _OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
@@ -84,7 +84,8 @@ def check_bench(given: object) -> None:
 
     The objects of a simulated bench, such as "block": [x, y, yaw] and "plate": [x, y], are keys of their own.
     "objects" are for benches laid out by people: name -> [x, y, yaw, width, depth]. "factors" are for simulated ones:
-    name -> value. Lengths are in metres, yaw in degrees. `layout_problems` compares it with one simulated bench.
+    name -> value; "choices" for those with a program of their own: name -> word. Lengths are in metres, yaw in
+    degrees. `layout_problems` compares it with one simulated bench.
     """
     if given is None:
         return
@@ -92,9 +93,11 @@ def check_bench(given: object) -> None:
         raise ValidationError(
             _sentence(given, f"a table such as {json.dumps(example_layout(load_schema(DEFAULT_BENCH)))}")
         )
-    objects, factors = given.get("objects", {}), given.get("factors", {})
+    objects, factors, choices = (given.get(key, {}) for key in _OTHER_KEYS)
     if not isinstance(factors, Mapping):
         raise ValidationError(_sentence(factors, 'a table such as {"light": 0.6}', "factors"))
+    if not isinstance(choices, Mapping):
+        raise ValidationError(_sentence(choices, 'a table such as {"task": "reach-v3"}', "choices"))
     if not isinstance(objects, Mapping):
         raise ValidationError(
             _sentence(objects, 'a table such as {"cup": [0.1, 0.3, 0, 0.08, 0.08]}', "objects")
@@ -111,14 +114,19 @@ def layout_problems(given: Mapping[str, Any], schema: BenchSchema) -> list[str]:
     """
     laid = simulated_bench(given) or {}
     places = [_place_problem(key, value, schema) for key, value in laid.items()]
-    factors = given.get("factors")
+    factors, choices = given.get("factors"), given.get("choices")
     odd = schema.factor_problems(factors) if isinstance(factors, Mapping) else ()
-    return [problem for problem in (*places, *odd) if problem]
+    other = schema.choice_problems(choices) if isinstance(choices, Mapping) else ()
+    return [problem for problem in (*places, *odd, *other) if problem]
 
 
 def example_layout(schema: BenchSchema) -> dict[str, Any]:
-    """Return a layout with every object of a simulated bench at the place that its schema proposes."""
-    return {name: list(thing.example) for name, thing in schema.objects.items()}
+    """Return a layout with every object of a simulated bench at the place that its schema proposes, and its usual
+    choices.
+    """
+    usual = {name: choice.usual for name, choice in schema.choices.items()}
+    laid = {name: list(thing.example) for name, thing in schema.objects.items()}
+    return laid | ({"choices": usual} if usual else {})
 
 
 def simulated_bench(given: Mapping[str, Any] | None) -> dict[str, Any] | None:

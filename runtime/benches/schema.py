@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import itertools
 import json
@@ -129,14 +130,48 @@ class Factor(Settings):
     high: float
 
 
+class Choice(Settings):
+    """Choice that a position makes on a bench with a program of its own, such as the task."""
+
+    title: Annotated[str, Field(min_length=1, max_length=60)]
+    usual: Annotated[str, Field(min_length=1, max_length=80)]
+    values: Annotated[
+        list[Annotated[str, Field(min_length=1, max_length=80)]], Field(min_length=1, max_length=500)
+    ]
+
+    @model_validator(mode="after")
+    def _has_its_usual(self) -> Choice:
+        if self.usual not in self.values or len(set(self.values)) < len(self.values):
+            raise SetupError(
+                f"usual = {self.usual!r}, values = {self.values}; allowed: one of them, each once"
+            )
+        return self
+
+
+class BenchProgram(Settings):
+    """Program that simulates a bench in a process and a Python environment of its own."""
+
+    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+\.py$")]
+    """Python file in the bench's folder, with a function `make_bench`, see `runtime.benches.interface`."""
+    requirements: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+\.txt$")] = "requirements.txt"
+    """File in the folder with the packages of its environment, in pip's format."""
+    observation: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """Numbers of its own observation vector; 0: it has none."""
+    variables: dict[Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]*$")], str] = Field(default_factory=dict)
+    """Environment variables of the program."""
+    content: Literal[""] | Annotated[str, Field(pattern="^[0-9a-f]{64}$")] = ""
+    """Digest of the folder's Python files and requirements; computed when the bench is loaded."""
+
+
 class Milestone(Settings):
-    """What the bench reports of an object."""
+    """What the bench reports, of an object or by itself."""
 
     text: Annotated[str, Field(min_length=1, max_length=120)]
     """What people read."""
-    when: Literal["held", "lifted", "above", "rests"]
-    """In a gripper; in one and clear of the table; the same above a disc; or at rest on a disc, released."""
-    object: Name
+    when: Literal["held", "lifted", "above", "rests", "reported"]
+    """In a gripper; in one and clear of the table; the same above a disc; or at rest on a disc, released. `reported`:
+    what a bench with a program of its own reports under this name."""
+    object: Annotated[str, Field(max_length=40)] = ""
     on: str = ""
     """Disc, for `above` and `rests`."""
 
@@ -146,15 +181,21 @@ class Milestone(Settings):
         return self.when != "rests"
 
 
+_GIVEN = ("area", "table_colour", "reach", "objects")  # what a bench without a program must declare
+_OURS = (*_GIVEN, "apart", "distractors", "factors", "together")  # what one with a program cannot have
+
+
 class BenchSchema(Settings):
     """What a bench consists of, and which layouts it accepts."""
 
     title: Annotated[str, Field(min_length=1, max_length=80)]
     instruction: str
-    area: Annotated[list[float], Field(min_length=4, max_length=4)]
-    table_colour: Colour
-    reach: Reach
-    objects: Annotated[dict[Name, Annotated[Box | Disc, Field(discriminator="shape")]], Field(min_length=1)]
+    area: Annotated[list[float], Field(min_length=4, max_length=4)] = Field(
+        default_factory=lambda: [-0.5, 0.5, 0.0, 0.5]
+    )
+    table_colour: Colour = Field(default_factory=lambda: [176, 164, 146])
+    reach: Reach = Field(default_factory=lambda: Reach(sides=[[0.0, 0.0]], distance=1.0))
+    objects: dict[Name, Annotated[Box | Disc, Field(discriminator="shape")]] = Field(default_factory=dict)
     apart: list[Apart] = Field(default_factory=list)
     distractors: Distractors = Distractors()
     factors: dict[FactorName, Factor] = Field(default_factory=dict)
@@ -166,10 +207,43 @@ class BenchSchema(Settings):
     """Objects that are placed so that one arm reaches all of them."""
     milestones: Annotated[dict[Name, Milestone], Field(min_length=1)]
     success: Annotated[list[Name], Field(min_length=1)]
-    """Milestones of the kind `rests` that together are the success of the task."""
+    """Milestones of the kind `rests`, or `reported`, that together are the success of the task."""
+    program: BenchProgram | None = None
+    """Program that simulates this bench; absent: ours, with contact forces."""
+    choices: Annotated[dict[Name, Choice], Field(max_length=20)] = Field(default_factory=dict)
+    """What a position chooses on a bench with a program."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> BenchSchema:
+        self._require_kind()
+        if self.program is None:
+            self._require_layout()
+        return self
+
+    def _require_kind(self) -> None:
+        given = self.model_fields_set
+        if self.program is None:
+            if absent := [key for key in _GIVEN if key not in given]:
+                raise SetupError(
+                    f"{', '.join(absent)}: absent; needed by a bench without a program of its own"
+                )
+            if self.choices:
+                raise SetupError("choices: only a bench with a program of its own has some; allowed: none")
+            return
+        if ours := [key for key in _OURS if key in given]:
+            raise SetupError(f"{', '.join(ours)}: the bench's own program decides on these; allowed: none")
+        for name, milestone in self.milestones.items():
+            if milestone.when != "reported" or milestone.object or milestone.on:
+                raise SetupError(
+                    f'milestones.{name}.when = {milestone.when!r}; allowed: "reported", without object and on, because '
+                    "the bench's own program reports it"
+                )
+        if strangers := [name for name in self.success if name not in self.milestones]:
+            raise SetupError(f"success = {strangers}; allowed: {', '.join(self.milestones)}")
+
+    def _require_layout(self) -> None:
+        if not self.objects:
+            raise SetupError("objects: none; allowed: one or more")
         x_from, x_to, y_from, y_to = self.area
         if not (x_from < x_to and y_from < y_to):
             raise SetupError(
@@ -203,7 +277,6 @@ class BenchSchema(Settings):
                 )
         if problem := next(self.problems({name: thing.example for name, thing in self.objects.items()}), ""):
             raise SetupError(f"the examples are no layout: {problem}")
-        return self
 
     def _require_objects(self) -> None:
         x_from, x_to, y_from, y_to = self.area
@@ -248,12 +321,22 @@ class BenchSchema(Settings):
 
     @property
     def digest(self) -> str:
-        """Digest of everything that the schema declares; two benches with the same digest are the same bench."""
-        content = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        """Digest of everything that the schema declares; two benches with the same digest are the same bench.
+
+        Keys that a bench without a program cannot have are left out, so that digests from before they existed hold.
+        """
+        without = {"program", "choices"} if self.program is None else set()
+        content = json.dumps(
+            self.model_dump(mode="json", exclude=without), sort_keys=True, separators=(",", ":")
+        )
         return f"sha256:{hashlib.sha256(content.encode()).hexdigest()}"
 
     def _require_milestones(self) -> None:
         for name, milestone in self.milestones.items():
+            if milestone.when == "reported":
+                raise SetupError(
+                    f'milestones.{name}.when = "reported"; allowed for a bench with a program of its own'
+                )
             on_disc = milestone.when in ("above", "rests")
             fits = milestone.on in self.discs if on_disc else not milestone.on
             if milestone.object not in self.boxes or not fits:
@@ -333,6 +416,17 @@ class BenchSchema(Settings):
                 number = "a whole number" if whole else "a number"
                 yield f"factors.{name} = {value!r:.40}; allowed: {number} from {factor.low:g} to {factor.high:g}"
 
+    def choice_problems(self, choices: Mapping[str, Any]) -> Iterator[str]:
+        """Yield a sentence for each of `choices` (name -> value) that the bench does not have, or not so."""
+        for name, value in choices.items():
+            choice = self.choices.get(name)
+            if choice is None:
+                yield f"choices.{name}: unknown choice; allowed: {', '.join(self.choices) or 'none'}"
+            elif value not in choice.values:
+                near = difflib.get_close_matches(str(value), choice.values, n=5) or choice.values
+                more = f" and {len(choice.values) - len(near)} more" if len(near) < len(choice.values) else ""
+                yield f"choices.{name} = {value!r:.80}; allowed: {', '.join(near)}{more}"
+
     def factor_values(self, factors: Mapping[str, float]) -> dict[str, float]:
         """Return the value of every factor: that of `factors`, or the usual one."""
         return {name: float(factors.get(name, factor.usual)) for name, factor in self.factors.items()}
@@ -375,6 +469,27 @@ def installed_benches() -> list[str]:
     return sorted(file.parent.name for file in FOLDER.glob(f"*/{FILE}"))
 
 
+def bench_folder(bench: str) -> Path:
+    """Return the folder of a bench: of one that comes with the program by name, else its path."""
+    return FOLDER / bench if bench in installed_benches() else Path(bench).expanduser()
+
+
+def _digest_program(folder: Path, program: BenchProgram) -> str:
+    """Return the digest of a program's Python files, also those of packages in its folder, and requirements.
+
+    Raises:
+        SetupError: If its file or its requirements are absent.
+    """
+    for name in (program.file, program.requirements):
+        if not (folder / name).is_file():
+            raise SetupError(f"program: {name} is not in {folder}; allowed: a file of the bench's folder")
+    digest = hashlib.sha256()
+    for file in sorted({*folder.rglob("*.py"), folder / program.requirements}):
+        for part in (file.relative_to(folder).as_posix().encode(), file.read_bytes()):
+            digest.update(len(part).to_bytes(8, "big") + part)
+    return digest.hexdigest()
+
+
 @cache  # cache: a bench stays the same while this runs; an integrator who edits it starts the station anew
 def load_schema(bench: str) -> BenchSchema:
     """Return the schema of a bench: the name of one that comes with the program, or the path of its folder.
@@ -384,9 +499,13 @@ def load_schema(bench: str) -> BenchSchema:
     """
     file = Path(bench, FILE)
     try:
-        file = (FOLDER / bench if bench in installed_benches() else Path(bench).expanduser()) / FILE
+        file = bench_folder(bench) / FILE
         tree = tomllib.loads(file.read_text(encoding="utf-8"))
-        return BenchSchema.model_validate(tree)
+        schema = BenchSchema.model_validate(tree)
+        if schema.program is None:
+            return schema
+        content = _digest_program(file.parent, schema.program)
+        return schema.model_copy(update={"program": schema.program.model_copy(update={"content": content})})
     except FileNotFoundError:
         raise UnusableBench(
             f"bench {bench!r} has no {FILE}; allowed: {', '.join(installed_benches())}, or the path of a bench's folder"

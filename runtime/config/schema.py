@@ -255,6 +255,10 @@ class LockstepSettings(Settings):
 
     delay_ticks: int = Field(default=0, ge=0)
     """Ticks between an observation and the arrival of its chunk."""
+    benchmark: bool = False
+    """Whether a simulated bench is run as published benchmarks are: it waits for the policy, gets each row as it was
+    given (float32, neither limited nor blended with others), and a run ends with the first success. Needs a simulated
+    transport, strategy "sync", safety.report_only = true and no delays."""
 
 
 class GripperSettings(Settings):
@@ -337,6 +341,48 @@ class Deployment(Settings):
                 'must be able to stop it; allowed with a [panel], else "hold"'
             )
         return self
+
+    @model_validator(mode="after")
+    def _is_exact_as_a_benchmark(self) -> Deployment:
+        if self.lockstep.benchmark:
+            self._require_exact()
+        return self
+
+    def _require_exact(self) -> None:
+        """Raise ConfigurationError if something would change or delay rows on their way to a benchmark's bench."""
+        delay = getattr(self.policy, "delay_ms", None)
+        needed: tuple[tuple[str, object, bool, str], ...] = (
+            (
+                "transport.simulated",
+                getattr(self.transport, "simulated", False),
+                bool(getattr(self.transport, "simulated", False)),
+                "true: a robot cannot wait",
+            ),
+            (
+                "strategy.kind",
+                self.strategy.kind,
+                self.strategy.kind == "sync",
+                '"sync": others blend or skip rows',
+            ),
+            (
+                "safety.report_only",
+                self.safety.report_only,
+                self.safety.report_only,
+                "true: rows are not limited",
+            ),
+            (
+                "lockstep.delay_ticks",
+                self.lockstep.delay_ticks,
+                self.lockstep.delay_ticks == 0,
+                "0: the bench waits",
+            ),
+            ("policy.delay_ms", delay, not delay or delay == [0.0], "none, or 0: the bench waits"),
+        )
+        for key, given, fits, allowed in needed:
+            if not fits:
+                raise ConfigurationError(
+                    f"{key} = {given!r} with lockstep.benchmark = true; allowed: {allowed}"
+                )
 
     def heartbeat_timeout_s(self, process: str) -> float:
         """Return the time without heartbeat after which `process` counts as dead [s].

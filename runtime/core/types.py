@@ -50,6 +50,7 @@ class Observation:
     truth: Mapping[str, Any] | None = None  # ground truth of a simulated bench (JSON), never for policies
     commanded: Float64 | None = None  # [D] last commanded position, None without commands
     drives: Mapping[str, Any] | None = None  # {"enabled": bool, "faults": [str]} if the node reports them
+    environment_state: Float64 | None = None  # a benchmark's own observation vector, as its bench gives it
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +107,11 @@ class RobotCommand:
     """Absolute target for the whole robot: float32 [D] in group order, for control tick `step`.
 
     `eef` are the poses of these joints in the format of the deployment's `publication`, None if it publishes joints.
+    `source` says what the target is: a row of the policy, or a motion or hold of our own.
     """
 
     action: Float32
     step: int
     time: float  # our monotonic clock [s]
     eef: Float32 | None = None
+    source: ControlSource = "unknown"

@@ -74,7 +74,11 @@ def push(
             hub.upload_file(
                 path_or_fileobj=card.encode(), path_in_repo=_CARD, repo_id=repository, repo_type="dataset"
             )
-        hub.create_tag(repository, tag=version, repo_type="dataset", exist_ok=True)
+        # LeRobot loads what the tag names: that of an earlier upload would hide this one.
+        tags = hub.list_repo_refs(repository, repo_type="dataset").tags
+        if any(tag.name == version for tag in tags):
+            hub.delete_tag(repository, tag=version, repo_type="dataset")
+        hub.create_tag(repository, tag=version, repo_type="dataset")
     except Exception as error:  # the client raises many types: network, hub, login
         raise RecordingError(
             f"{root} is not pushed to {repository}: {type(error).__name__}: {error}"
@@ -152,5 +156,5 @@ def _client(what_cannot: str) -> Any:
     except ImportError as error:
         raise RecordingError(
             f"{what_cannot}: the package huggingface_hub is not installed ({error}); install it into the environment "
-            "of the lab, and log in with its own command"
+            "of the lab by pip install 'eva-web[hub]', and log in with its own command"
         ) from error

@@ -77,7 +77,7 @@ def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> 
             f"{dataset.root} has no column {column or ' or '.join(STATES)} of measured joints: name one of "
             f"{', '.join(vectors) or 'none, it has no vectors'}"
         )
-    if robot and robot not in robots.robot_names():
+    if robot and not robots.is_described(robot):
         raise RecordingError(f"robot {robot!r} does not exist; there are: {', '.join(robots.robot_names())}")
     return SourceRobot(column, robot)
 

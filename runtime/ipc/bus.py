@@ -408,16 +408,24 @@ class Subscriber:
         if time.monotonic() - self._read_at > _AWAY_S:
             self._socket.close(linger=0)
             self._connect()
-        newest: dict[str, bytes] = {}
-        wait = int(timeout * 1000)
-        while self._socket.poll(wait):
-            name, payload = self._socket.recv_multipart()
-            newest[name.decode()] = payload
-            wait = 0
-        self._read_at = time.monotonic()
+        newest = dict(self._waiting(timeout))
         return {
             name: unpack(payload) if name[:7] != "camera/" else payload for name, payload in newest.items()
         }
+
+    def receive_all(self, timeout: float) -> list[tuple[str, Any]]:
+        """Return (stream, content) of every message within `timeout` seconds, in order, for streams of events."""
+        return [(name, unpack(payload)) for name, payload in self._waiting(timeout)]
+
+    def _waiting(self, timeout: float) -> list[tuple[str, bytes]]:
+        messages = []
+        wait = int(timeout * 1000)
+        while self._socket.poll(wait):
+            name, payload = self._socket.recv_multipart()
+            messages.append((name.decode(), payload))
+            wait = 0
+        self._read_at = time.monotonic()
+        return messages
 
     def close(self) -> None:
         self._socket.close()

@@ -50,14 +50,16 @@ class BenchRequest(Settings):
 
     `positions` are the places of the bench's objects by name in the world frame: x, y [m] and, of objects that can be
     turned, yaw [degrees]. Objects without a place are laid anywhere. `factors` are values of the bench's factors by
-    name; the others are as usual. The bench's own schema decides what it accepts. `of` is the bench that the layout
-    belongs to, by name or folder, and `schema_digest` the digest of its schema; absent, any bench that accepts it.
+    name, and `choices` those of its choices; the others are as usual. The bench's own schema decides what it accepts.
+    `of` is the bench that the layout belongs to, by name or folder, and `schema_digest` the digest of its schema;
+    absent, any bench that accepts it.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     seed: int = Field(ge=0, le=_HIGHEST_SEED)
     positions: Annotated[dict[str, Place], Field(max_length=100)] | None = None
     factors: Annotated[dict[str, float], Field(max_length=20)] | None = None
+    choices: Annotated[dict[str, Label], Field(max_length=20)] | None = None
     of: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     schema_digest: Annotated[str, Field(max_length=80)] | None = None
 

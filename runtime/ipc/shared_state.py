@@ -83,15 +83,18 @@ class EStop(IntEnum):
 _ESTOPS = tuple(EStop)
 
 
+_OPTIONAL = ("qvel", "effort", "eef", "reported_action", "reported_action_eef", "environment_state")
+
+
 @functools.cache  # cache: every observation asks
-def _observation_dtype(d: int, e: int, c: int) -> np.dtype[np.void]:
+def _observation_dtype(d: int, e: int, c: int, v: int) -> np.dtype[np.void]:
     return np.dtype(
         [
             ("sequence", "i8"),
             ("arrived", "f8"),
             ("joints_captured", "f8"),
             ("eef_captured", "f8"),
-            ("has", "u1", 5),  # qvel, effort, eef, reported_action, reported_action_eef
+            ("has", "u1", 6),  # the members of _OPTIONAL
             ("last", "u1"),
             ("qpos", "f4", d),
             ("qvel", "f4", d),
@@ -99,6 +102,7 @@ def _observation_dtype(d: int, e: int, c: int) -> np.dtype[np.void]:
             ("eef", "f4", e),
             ("reported_action", "f4", d),
             ("reported_action_eef", "f4", e),
+            ("environment_state", "f8", v),
             ("picture_captured", "f8", c),
             ("picture_number", "i8", c),  # per camera; slot = number % PICTURE_SLOTS, 0 = none yet
         ]
@@ -113,10 +117,13 @@ class SharedStateLayout:
     eef_dim: int
     cameras: tuple[str, ...]
     picture_bytes: int = 1920 * 1080 * 3
+    vector: int = 0  # width of a benchmark's own observation vector
 
     def observation_dtype(self) -> np.dtype[np.void]:
         """Return the type of the newest observation, with the slot numbers of its pictures."""
-        return _observation_dtype(self.dim, max(self.eef_dim, 1), max(len(self.cameras), 1))
+        return _observation_dtype(
+            self.dim, max(self.eef_dim, 1), max(len(self.cameras), 1), max(self.vector, 1)
+        )
 
     def control_dtype(self) -> np.dtype[np.void]:
         """Return the type of control's status: its last tick and its timing."""
@@ -327,8 +334,10 @@ class SharedState:
         record["eef_captured"] = observation.captured.get("eef", np.nan)
         record["last"] = observation.last
         record["qpos"] = observation.qpos
-        for index, name in enumerate(("qvel", "effort", "eef", "reported_action", "reported_action_eef")):
+        for index, name in enumerate(_OPTIONAL):
             value = getattr(observation, name)
+            if name == "environment_state" and np.shape(value) != (self.layout.vector,):
+                continue  # of a node whose bench declares none
             if value is not None:
                 record["has"][index] = 1
                 record[name] = value
@@ -367,9 +376,9 @@ class SharedState:
         return pictures
 
     def _observation(self, record: np.void, pictures: dict[str, UInt8]) -> Observation:
-        names = ("qvel", "effort", "eef", "reported_action", "reported_action_eef")
         optional = {
-            name: np.array(record[name]) if record["has"][index] else None for index, name in enumerate(names)
+            name: np.array(record[name]) if record["has"][index] else None
+            for index, name in enumerate(_OPTIONAL)
         }
         captured = {"joints": float(record["joints_captured"])}
         if record["has"][2]:

@@ -10,4 +10,5 @@ KINDS = {
     "replay": "runtime.policies.replay",
     "roboarena": "runtime.policies.roboarena",
     "starvla": "runtime.policies.starvla",
+    "xpolicylab": "runtime.policies.xpolicylab",
 }

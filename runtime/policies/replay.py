@@ -151,7 +151,7 @@ class ReplayPolicy(Policy):
     def _require_same_robot(self, recorded: _Recorded) -> None:
         """Raise PolicyError if the actions are known to be of another robot, or in another order of joints."""
         own = self._robot
-        if recorded.robot in robots.robot_names() and recorded.robot != own.name:
+        if robots.is_described(recorded.robot) and recorded.robot != own.name:
             raise PolicyError(
                 f"{self._config.path} is of the robot {recorded.robot}, the station's is {own.name}"
             )

@@ -49,6 +49,8 @@ class RequestSettings(Settings):
     state_parts: dict[str, Dims] = Field(default_factory=dict)
     """Further request keys and the indices of the state vector that they contain (DROID: joints and gripper
     separately)."""
+    environment_state_key: str = ""
+    """Request key of a benchmark's own observation vector, which some simulated benches have; "" does not send it."""
     prompt_key: str = "prompt"
     """Request key of the instruction."""
 
@@ -82,6 +84,12 @@ class RequestLayout:
         cameras = self._cameras if self._cameras is not None else {key: key for key in observation.pictures}
         pictures = {key: self._picture(observation, camera) for camera, key in cameras.items()}
         request |= {settings.images_key: pictures} if settings.images_key else pictures
+        if settings.environment_state_key:
+            if observation.environment_state is None:
+                raise PolicyError(
+                    "policy.environment_state_key is set, but the bench has no observation vector of its own"
+                )
+            request[settings.environment_state_key] = observation.environment_state
         if settings.prompt_key:
             request[settings.prompt_key] = observation.prompt
         return request

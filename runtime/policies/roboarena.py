@@ -130,11 +130,6 @@ class RoboarenaPolicy(WebsocketPolicy):
             self._require_acknowledged(self._value(answer, "an acknowledgement"))
         self._ending = None
 
-    def _reopen(self) -> None:
-        if self._link.closed_by_peer:
-            self._link.close_gracefully()
-        self._require_open()
-
     def _session_field(self) -> dict[str, str]:
         return {"session_id": self._session} if self._wants is not None and self._wants.session else {}
 

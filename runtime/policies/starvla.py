@@ -8,8 +8,6 @@ The server's process ends after a while without requests, so a ping is sent when
 
 from __future__ import annotations
 
-import logging
-import threading
 import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -31,15 +29,15 @@ from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.action_layout import ActionLayoutSettings
 from runtime.policies.action_rows import parse_action_rows
 from runtime.policies.base import PolicyInfo
+from runtime.policies.idle_pings import IdlePingPolicy
 from runtime.policies.normalization import Statistics
 from runtime.policies.request_layout import PIXELS, RequestLayout, Size
-from runtime.policies.websocket import ServerSettings, WebsocketPolicy
+from runtime.policies.websocket import ServerSettings
 from runtime.policies.websocket_link import error_headline
 
 if TYPE_CHECKING:
     from robots import Robot
 
-log = logging.getLogger(__name__)
 _ENVIRONMENTS = (
     "starvla_policy_server",
     "simpler_env",
@@ -73,13 +71,16 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> St
     return StarvlaPolicy(config, robot)
 
 
-class StarvlaPolicy(WebsocketPolicy):
-    """Policy with one example per request; a connection that the server closed between requests is opened again."""
+class StarvlaPolicy(IdlePingPolicy):
+    """Policy with one example per request; a connection that the server closed between requests is opened again.
+
+    On connect it sends a ping, which only StarVLA's server answers.
+    """
 
     PROTOCOL = "StarVLA"
 
     def __init__(self, config: Config, robot: Robot) -> None:
-        super().__init__(config)
+        super().__init__(config, config.ping_every)
         if not config.cameras or len(set(config.cameras)) != len(config.cameras):
             raise ConfigurationError(
                 f"policy.cameras = {config.cameras}; allowed: the views in the order of the training, each once of "
@@ -95,22 +96,6 @@ class StarvlaPolicy(WebsocketPolicy):
         self.uses_poses = config.uses_poses
         self._unnorm_key = config.unnorm_key
         self._number = 0
-        self._spoken = time.monotonic()
-        self._silent = threading.Event()
-        self._silent.set()
-
-    def connect(self) -> PolicyInfo:
-        """Connect, read the metadata, send a ping, which only StarVLA's server answers, and start regular pings."""
-        info = super().connect()
-        if self._config.ping_every and self._silent.is_set():
-            self._silent = threading.Event()
-            threading.Thread(
-                target=self._ping_while_idle,
-                args=(self._silent, self._config.ping_every),
-                name="starvla-ping",
-                daemon=True,
-            ).start()
-        return info
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """Return the chunk; `timing` contains our `round_trip_ms`.
@@ -120,9 +105,7 @@ class StarvlaPolicy(WebsocketPolicy):
         if conditioning is not None:
             raise PolicyError("the StarVLA protocol has no real-time chunking; choose another strategy")
         with self._lock:
-            if self._link.closed_by_peer:
-                self._link.close_gracefully()
-            self._require_open()
+            self._reopen()
             envelope = self._envelope("infer") | {"payload": self.payload(observation)}
             answer, round_trip = self._exchange(msgpack_arrays.pack(envelope))
             self._spoken = time.monotonic()
@@ -132,11 +115,6 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def reset(self) -> None:
         """Do nothing, because the protocol has no reset, and no response depends on an earlier request."""
-
-    def close(self) -> None:
-        """Close the connection as every policy does, and stop the pings."""
-        self._silent.set()
-        super().close()
 
     def payload(self, observation: Observation) -> dict[str, Any]:
         """Return the content of a request: one example, and the key of the model's statistics if there is one."""
@@ -191,24 +169,6 @@ class StarvlaPolicy(WebsocketPolicy):
         )
         self._check_reply(reply, envelope)
         self._spoken = time.monotonic()
-
-    def _ping_while_idle(self, silent: threading.Event, every: float) -> None:
-        """Send pings over an idle connection until `silent` is set.
-
-        A ping is sent when there was no request for at least half of `every` [s]. No ping is sent while a request is
-        pending.
-        """
-        while not silent.wait(every / 2):
-            if not self._lock.acquire(blocking=False):
-                continue
-            try:
-                if self._link.is_open and time.monotonic() - self._spoken >= every / 2:
-                    self._ping(self._config.inference_deadline)
-            except PolicyError as error:
-                log.warning("the policy server did not answer a ping, the connection is dropped: %s", error)
-                self._link.close_gracefully()
-            finally:
-                self._lock.release()
 
     def _check_reply(self, reply: Mapping[str, Any], envelope: Mapping[str, Any]) -> None:
         """Raise PolicyError if the reply reports an error, or belongs to another request; then the connection is also

@@ -88,7 +88,7 @@ class WebsocketPolicy(Policy):
         with self._lock:
             self._warm, self._last = False, None
             self._excused.clear()
-            self._link.close_gracefully()
+            self._leave()
             with self._turning:
                 self._closed = False
                 self._link = self._new_link()
@@ -104,10 +104,14 @@ class WebsocketPolicy(Policy):
             # With a free lock no call waits, so the server gets a close frame; otherwise `abort` cuts the call.
             if self._lock.acquire(blocking=False):
                 try:
-                    self._link.close_gracefully()
+                    self._leave()
                 finally:
                     self._lock.release()
             self._link.abort()
+
+    def _leave(self) -> None:
+        """Close the connection, of which the server is informed."""
+        self._link.close_gracefully()
 
     def _new_link(self) -> WebsocketLink:
         return WebsocketLink(
@@ -121,19 +125,34 @@ class WebsocketPolicy(Policy):
         if not self._link.is_open:
             self._open()
 
+    def _reopen(self) -> None:
+        """Open a connection if there is none, or if the server closed it. Raises PolicyError after `close`."""
+        if self._link.closed_by_peer:
+            self._link.close_gracefully()
+        self._require_open()
+
     def _open(self) -> PolicyInfo:
         if self._server.health_path is not None:
             deadline = self._server.connect_deadline
             require_healthy(
                 self._server.url, self._server.health_path, self._headers, deadline, self.address_override
             )
-        metadata = self._decode(self._link.open(), "metadata")
         self._last = None  # the first response on a connection belongs to its first request
         try:
-            return self._check_metadata(metadata)
+            return self._check_metadata(self._read_metadata())
         except PolicyError:
             self._link.close_gracefully()
             raise
+
+    def _read_metadata(self) -> dict[str, Any]:
+        """Open the link and return the server's metadata, which most servers send first."""
+        return self._decode(self._link.open(), "metadata")
+
+    def _next_deadline(self) -> float:
+        """Return the time allowed for the next inference [s]; the first after `connect` may take longer."""
+        seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
+        self._warm = True
+        return seconds
 
     def _exchange(self, request: bytes) -> tuple[bytes, float]:
         """Return the response to `request` and its round trip [ms].
@@ -142,8 +161,7 @@ class WebsocketPolicy(Policy):
         response cannot be to an earlier one. If the server responds in the same way there, the reason for the suspicion
         is ignored from then on.
         """
-        seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
-        self._warm = True
+        seconds = self._next_deadline()
         started = time.monotonic()
         answer, took = self._exchange_once(request, seconds)
         doubted, doubt = answer, self._mismatch_reason(request, answer, took)
@@ -179,12 +197,16 @@ class WebsocketPolicy(Policy):
 
     def _value(self, payload: bytes, label: str) -> Any:
         try:
-            return msgpack_arrays.unpack(payload, ANSWER_LIMIT)
+            return self._unpack(payload)
         except CodecError as error:
             self._link.close_gracefully()
             raise WrongProtocolError(
                 _OTHER_PROTOCOL(url=self._server.url, what=label, protocol=self.PROTOCOL, error=error)
             ) from error
+
+    def _unpack(self, payload: bytes) -> Any:
+        """Return the value of one message. Raises CodecError."""
+        return msgpack_arrays.unpack(payload, ANSWER_LIMIT)
 
 
 def headers(server: ServerSettings) -> dict[str, str]:

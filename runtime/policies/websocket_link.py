@@ -1,7 +1,8 @@
 """Websocket to a policy server: a first frame on connect, then strictly one response to each request.
 
-Responses carry no id. A connection whose response is late is therefore dropped and never reused, and so is a connection
-on which a message waits before a request is sent.
+Most responses carry no id. A connection whose response is late is therefore dropped and never reused, and so is a
+connection on which a message waits before a request is sent. Where they do carry one, `exchange_matched` skips those to
+other requests.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from runtime.core.errors import (
     PolicyDisconnected,
@@ -33,6 +34,8 @@ from runtime.policies.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
+
+Answer = TypeVar("Answer")
 
 _ITS_METADATA = fixed("policy.server.its_metadata", "its metadata")
 _NOT_CONNECTED = Pattern("policy.server.not_connected", "there is no connection to {url}; connect first")
@@ -157,11 +160,25 @@ class WebsocketLink:
             PolicyLostError: No server listens at the url at present.
             PolicyError: Another kind of server listens there.
         """
-        self.drop()
         deadline = time.monotonic() + self._connect_deadline
+        connection = self._connected(deadline)
+        with self._dropping_on_error():
+            return self._receive(connection, deadline, _ITS_METADATA, self._connect_deadline)
+
+    def open_silent(self) -> float:
+        """Connect anew to a server that only answers; return what is left of the connect deadline [s].
+
+        Raises the same errors as `open`.
+        """
+        deadline = time.monotonic() + self._connect_deadline
+        self._connected(deadline)
+        return max(0.0, deadline - time.monotonic())
+
+    def _connected(self, deadline: float) -> ClientConnection:
+        self.drop()
         try:
             self._require_not_aborted()
-            self._connection = self._connect(deadline)
+            connection = self._connection = self._connect(deadline)
         except PolicyError:
             self._require_not_aborted()
             raise
@@ -169,7 +186,7 @@ class WebsocketLink:
             self._shaking = None
         with self._dropping_on_error():
             self._require_not_aborted()
-            return self._receive(self._connection, deadline, _ITS_METADATA, self._connect_deadline)
+        return connection
 
     def exchange(self, request: bytes, seconds: float) -> bytes:
         """Return the response to `request`.
@@ -201,6 +218,28 @@ class WebsocketLink:
             answer = self._frame(connection, deadline, _AN_ACKNOWLEDGEMENT, seconds)
             return None if answer == text else self._binary(answer)
 
+    def exchange_matched(
+        self, request: bytes, seconds: float, label: str, match: Callable[[bytes], Answer | None]
+    ) -> Answer:
+        """Return what `match` makes of the response to `request`; messages for which it returns None are skipped.
+
+        `label` names the response in errors, which are those of `exchange`.
+        """
+        connection = self._connection
+        if connection is None:
+            raise PolicyError(_NOT_CONNECTED(url=self._url))
+        deadline = time.monotonic() + seconds
+        with self._dropping_on_error():
+            self._send(connection, request, seconds)
+            while True:
+                answer = match(self._receive(connection, deadline, label, seconds))
+                if answer is not None:
+                    return answer
+                if (
+                    time.monotonic() >= deadline
+                ):  # else a server that keeps sending others would hold us for ever
+                    raise PolicyTimeout(_NOT_IN_TIME(url=self._url, what=label, seconds=seconds))
+
     def abort(self) -> None:
         """Make calls that wait in another thread raise PolicyError, now and later.
 
@@ -217,16 +256,31 @@ class WebsocketLink:
         if self._aborted:
             raise PolicyError(_CLOSED_BY_US(url=self._url))
 
-    def close_gracefully(self) -> None:
-        """Send a close frame and close the connection, in a separate thread, without waiting for it.
+    def close_gracefully(self, farewell: bytes | None = None) -> None:
+        """Send `farewell` and a close frame and close the connection, in a separate thread, without waiting for it.
 
-        Without a close frame, servers print a traceback.
+        Without a close frame, servers print a traceback. `farewell` is the protocol's own last message, if it has one.
+        If the server does not read, the connection is cut: the thread would otherwise prevent the end of the process.
         """
+        from websockets.exceptions import ConnectionClosed
+
         self._watchdog.stop()
         connection, self._connection = self._connection, None
         resources = self._stack.pop_all()
-        if connection is not None:
-            threading.Thread(target=resources.close, name=CLOSING).start()
+        if connection is None:
+            return
+
+        watchdog = Watchdog("websocket-leave-send", lambda: _end(connection.socket))
+
+        def leave() -> None:
+            try:
+                with watchdog.deadline(2 * _CLOSE_TIMEOUT), resources, contextlib.suppress(ConnectionClosed):
+                    if farewell is not None:
+                        connection.send(farewell)
+            finally:
+                watchdog.stop()
+
+        threading.Thread(target=leave, name=CLOSING).start()
 
     def drop(self) -> None:
         """Close without waiting for the server. Safe to call twice."""

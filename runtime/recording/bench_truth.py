@@ -10,7 +10,7 @@ from typing import Any
 from runtime.core.errors import RecordingError
 
 JUDGED = "milestones"
-_KEPT = ("blocks", "plate", "discs", "edges", "colours", "factors", JUDGED)
+_KEPT = ("blocks", "plate", "discs", "edges", "colours", "factors", "choices", "observation", JUDGED)
 _DECIMALS = 4  # 0.1 mm, so that objects at rest yield the same text in every row
 
 

@@ -1,7 +1,8 @@
 """Command filter of a careful execution node: one master; targets that are fresh, finite and within limits; a deadline.
 
 Control words that switch the drives of a simulated robot (`runtime.simulation.drives`) are accepted from any client. A
-node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions` and `factors`.
+node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions`, `factors` and
+`choices`.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Control = Literal["collect_start", "collect_stop", "hil_start", "hil_stop"]
+ACTING = ("policy", "teleop")  # sources of rows; others are motions and holds of the station's own
 ANONYMOUS = "anonymous"  # name of clients that send none, as older versions
 MASTER_SILENCE = 1.0  # [s] silence after which another client may become master
 _TOLERANCE = 1e-5  # limits are transmitted as float32
@@ -35,10 +37,11 @@ _MESSAGE_LIMIT = 1024 * 1024  # [bytes]; a command has a few hundred
 @dataclass(frozen=True, slots=True)
 class AcceptedCommand:
     """Accepted message; exactly one field is set: a target [D], a control word, a bench reset or a switch of the
-    drives.
+    drives. A target is `acting` if it is a row of a policy or of a leader.
     """
 
     target: Float64 | None = None
+    acting: bool = False
     control: Control | None = None
     reset: ResetRequest | None = None
     switch: drives.DriveSwitch | None = None
@@ -50,11 +53,13 @@ class CommandGate:
     `refused` counts rejected messages by reason. A target is also refused if it was sent more than `deadline` [s] ago
     according to the master's own clock, provided that this clock advances. `ack` is the `seq` of the master's newest
     message that took effect, None if the master does not number its messages. `bench` is True if the node has a bench
-    that can be reset.
+    that can be reset. With `as_given`, targets may be beyond the robot's limits, as in a benchmark that limits them
+    itself.
     """
 
-    def __init__(self, robot: Robot, deadline: float, bench: bool = False) -> None:
+    def __init__(self, robot: Robot, deadline: float, bench: bool = False, as_given: bool = False) -> None:
         self._robot = robot
+        self._as_given = as_given
         self._deadline = deadline
         self._bench = bench
         self._heard = float("-inf")  # arrival of the master's last message, accepted or not
@@ -138,17 +143,16 @@ class CommandGate:
         return AcceptedCommand(switch=switch)
 
     def _reset(self, message: dict[Any, Any]) -> AcceptedCommand | None:
-        name, seed, positions, factors = (message.get(key) for key in ("id", "seed", "positions", "factors"))
+        name, seed, *tables = (message.get(key) for key in ("id", "seed", "positions", "factors", "choices"))
         if not self._bench:
             self.refused["no_bench"] += 1
             return None
         named = isinstance(name, str) and 0 < len(name) <= _LONGEST_ID
         seeded = isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0
-        tables = all(table is None or isinstance(table, dict) for table in (positions, factors))
-        if not (named and seeded and tables):
+        if not (named and seeded and all(table is None or isinstance(table, dict) for table in tables)):
             self.refused["malformed"] += 1
             return None
-        return AcceptedCommand(reset=ResetRequest(str(name), int(seed or 0), positions, factors))
+        return AcceptedCommand(reset=ResetRequest(str(name), int(seed or 0), *tables))
 
     def _target(self, message: dict[Any, Any], arrival: float) -> AcceptedCommand | None:
         action = message.get("action")
@@ -157,9 +161,10 @@ class CommandGate:
             self.refused[reason] += 1
             return None
         self._accepted = arrival
-        return AcceptedCommand(
-            target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper)
-        )
+        target = np.asarray(action, np.float64)
+        if not self._as_given:
+            target = np.clip(target, self._robot.lower, self._robot.upper)
+        return AcceptedCommand(target=target, acting=message.get("source") in ACTING)
 
     def _late(self, stamp: object, arrival: float) -> bool:
         """Return True if the target was sent longer ago than the deadline.
@@ -181,5 +186,7 @@ class CommandGate:
             return "dimension"
         if not np.isfinite(action).all():
             return "not_finite"
+        if self._as_given:
+            return ""
         low, high = self._robot.lower - _TOLERANCE, self._robot.upper + _TOLERANCE
         return "" if ((action >= low) & (action <= high)).all() else "limits"

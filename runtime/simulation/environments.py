@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +16,7 @@ from runtime.simulation.bench.conveyor import Conveyor
 from runtime.simulation.bench.numbered_frames import Scene
 from runtime.simulation.bench.plant import Plant
 from runtime.simulation.bench.tabletop import Tabletop
+from runtime.simulation.environment import Environment
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -27,32 +27,6 @@ OWN = (
     "conveyor",
     "contact",
 )  # other values are benches by name, or paths of their folders
-
-
-class Environment(ABC):
-    """Environment of a simulated robot: it advances the robot and everything that it touches, and renders the
-    cameras.
-    """
-
-    @abstractmethod
-    def move(self, plant: Plant, seconds: float) -> None:
-        """Advance the plant and everything that it touches by `seconds`."""
-
-    @abstractmethod
-    def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """Return a BGR uint8 [H, W, 3] image per camera key; callers must not write to them."""
-
-    @abstractmethod
-    def truth(self) -> dict[str, object] | None:
-        """Return the ground truth of the bench; None if there is no bench."""
-
-    @abstractmethod
-    def reset(self, wish: ResetRequest) -> None:
-        """Reset the bench as requested.
-
-        Raises:
-            BenchError: If the requested layout is not possible.
-        """
 
 
 class TestPatternEnvironment(Environment):
@@ -126,8 +100,8 @@ def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
     "contact" is the tabletop with contact forces; benches by name or path have contact forces.
 
     Raises:
-        SetupError: If --blocks is not 1 with a conveyor, there is no such bench, or the contact physics is not
-            installed.
+        SetupError: If --blocks is not 1 with a conveyor, there is no such bench, the contact physics or the
+            environment of the bench's own program is not installed, or that program does not start.
         BenchError: If the blocks do not fit on the bench.
     """
     if options.bench == "conveyor":
@@ -140,6 +114,12 @@ def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
         return BenchEnvironment(robot, options, Tabletop(robot, options.seed, options.blocks))
     if options.bench == "none":
         return TestPatternEnvironment(robot, options)
+    if options.bench != "contact" and load_schema(options.bench).program is not None:
+        from runtime.simulation.own_program import (
+            ProgramEnvironment,
+        )  # no other environment needs its modules
+
+        return ProgramEnvironment(robot, options)
     from runtime.simulation.contact.bench import ContactTabletop  # no other environment needs its modules
 
     table = Bench(load_schema("tabletop" if options.bench == "contact" else options.bench))

@@ -70,13 +70,16 @@ class InProcessNode(Source, Sink):
             eef=frame.eef,
             truth=frame.truth,
             drives=frame.drives,
+            environment_state=frame.environment_state,
         )
         self._seen(observation)
         return observation
 
     def send(self, command: RobotCommand) -> None:
         """Queue a command, which the node executes at the next `receive`."""
-        self._queue_message({"t": command.time, "target": "real", "action": command.action})
+        self._queue_message(
+            {"t": command.time, "target": "real", "action": command.action, "source": command.source}
+        )
 
     def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         """Queue a control word, which the node executes at the next `receive`."""

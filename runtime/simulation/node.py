@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from threading import Event
 
     from robots import Robot
-    from runtime.simulation.environments import Environment
+    from runtime.simulation.environment import Environment
 
 LONGEST_STEP = 0.2  # [s] longest time step, so that a suspended node does not jump
 _GARBAGE = b"\x85\xa1t"  # map of five entries, truncated within the first
@@ -73,11 +73,14 @@ class Node:
         self._clock = clock
         self._plant = Plant(robot, start=start_pose(robot, options.start_pose))
         self._drives = Drives(not options.drives_disabled, options.drive_fault)
-        self._gate = CommandGate(robot, options.deadline, bench=options.bench != "none")
+        self._gate = CommandGate(
+            robot, options.deadline, bench=options.bench != "none", as_given=options.as_given
+        )
         self._surroundings = around or environments.make_environment(robot, options)
-        self._leader = Gesture(robot, options.seed)
+        self._leader = Gesture(robot, options.seed) if robot.arms else None
         self._leader_phase: float | None = None  # of the leader's gesture; None unless it collects
         self._hil_error = ""
+        self._unlaid: dict[str, str] = {}  # the last reset, if it was refused, and why
         self._frozen: UInt8 | None = None
         self._holding = True
         self._sequence = 0
@@ -110,12 +113,13 @@ class Node:
         if self._sockets is not None:
             self._sockets.close()
         self._sockets = None
+        self._surroundings.close()
 
     def _obey(self, payloads: Sequence[bytes]) -> None:
         """Filter the received messages and execute the accepted ones; of several targets only the newest takes
         effect.
         """
-        newest = None
+        newest = row = None
         for payload in payloads:
             accepted = self._gate.accept(payload, self._clock.now())
             if accepted is not None and accepted.control is not None:
@@ -126,14 +130,17 @@ class Node:
                 self._drives.apply(accepted.switch)
             elif accepted is not None:
                 newest = accepted.target
+                row = newest if accepted.acting else None
         if newest is not None and self._leader_phase is not None:
             self._gate.refused["collecting"] += 1
         elif newest is not None:
-            self._plant.target = newest
+            self._plant.target, self._plant.row = newest, row
 
     def _control(self, accepted: AcceptedCommand) -> None:
         """Execute a control word; it may be received several times, which has no further effect."""
-        if accepted.control == "collect_start" and self._leader_phase is None:
+        if accepted.control == "collect_start" and self._leader is None:
+            self._gate.refused["no_leader"] += 1
+        elif accepted.control == "collect_start" and self._leader is not None and self._leader_phase is None:
             self._leader_phase = self._leader.phase_of(self._plant.q)
         elif accepted.control == "collect_stop" and self._leader_phase is not None:
             self._leader_phase = None
@@ -146,14 +153,17 @@ class Node:
     def _reset_bench(self, wish: ResetRequest) -> None:
         try:
             self._surroundings.reset(wish)
-        except BenchError:
+        except BenchError as error:
             self._gate.refused["bench_layout"] += 1
+            self._unlaid = {"id": wish.id, "why": str(error)}
+        else:
+            self._unlaid = {}
 
     def _move(self, seconds: float) -> None:
         silent = self._gate.is_silent(self._clock.now())
         if not self._drives.enabled:
             self._plant.hold()
-        elif self._leader_phase is not None:
+        elif self._leader_phase is not None and self._leader is not None:
             self._leader_phase += self._leader.turn(seconds)
             self._plant.target = self._leader.towards(self._leader_phase, self._plant.target, seconds)
         elif silent and not self._holding:
@@ -168,7 +178,7 @@ class Node:
             "images": self._pictures(),
             "state": {name: part.astype(np.float32) for name, part in robot.split(q).items()},
         }
-        if not self._options.no_eef:
+        if robot.arms and not self._options.no_eef:
             message["eef"] = poses(robot, q)
         if self._leader_phase is not None:
             applied = self._plant.target
@@ -181,7 +191,13 @@ class Node:
         message |= {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
         message |= {} if self._gate.ack is None else {"ack": self._gate.ack}
         message["drives"] = self._drives.status()
+        vector = self._surroundings.state_vector()
+        message |= {} if vector is None else {"environment_state": vector}
         truth = self._surroundings.truth()
+        if truth is not None and self._options.as_given:
+            truth["benchmark"] = True
+        if truth is not None and self._unlaid:
+            truth["refused"] = dict(self._unlaid)
         return message if truth is None else message | {"truth": truth}
 
     def _pictures(self) -> dict[str, UInt8]:
@@ -236,6 +252,9 @@ def parser() -> argparse.ArgumentParser:
         default="none",
         help=f"what there is to touch: {', '.join(environments.OWN)} (default: none), or with contact forces "
         f"{', '.join(installed_benches())}, or the path of a bench's folder",
+    )
+    line.add_argument(
+        "--as-given", action="store_true", help="targets beyond the robot's limits too, for a benchmark"
     )
     line.add_argument("--blocks", type=int, default=1, help="on the tabletop; the first is the task's")
     line.add_argument("--start-pose", metavar="NAME", default="home", help="a pose of the robot")

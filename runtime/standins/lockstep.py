@@ -29,7 +29,7 @@ from runtime.processes.lockstep.lockstep import Peers
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.reception.process import make_source
 from runtime.simulation import environments, program
-from runtime.simulation.environments import Environment
+from runtime.simulation.environment import Environment
 from runtime.simulation.in_process_node import InProcessNode
 from runtime.simulation.leader import AttachedLeader, demonstrator
 from runtime.simulation.node import Node
@@ -44,20 +44,31 @@ PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
 class SuccessDetector:
-    """Detector of the end of a run: the bench's ground truth has reported success for REST_S."""
+    """Detector of the end of a run: the bench's ground truth has reported success for `rest` [s], or its own end."""
 
-    def __init__(self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock) -> None:
-        self._truth, self._clock = truth, clock
+    def __init__(
+        self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock, rest: float = REST_S
+    ) -> None:
+        self._truth, self._clock, self._rest = truth, clock, rest
         self._since: float | None = None
 
     def __call__(self, running: bool) -> str:
         truth = self._truth() if running else None
+        if truth and truth.get("over"):
+            return f"the simulated bench is over: {truth['over']}"
         if not (truth and truth["success"]):
             self._since = None
             return ""
+        if not self._rest:
+            return "the simulated bench has said success"
         self._since = self._clock.now() if self._since is None else self._since
-        rested = self._clock.now() - self._since >= REST_S - 1e-6
-        return f"the simulated bench has said success for {REST_S:g} s" if rested else ""
+        rested = self._clock.now() - self._since >= self._rest - 1e-6
+        return f"the simulated bench has said success for {self._rest:g} s" if rested else ""
+
+
+def success_detector(spec: StationSpec, around: Environment, clock: Clock) -> SuccessDetector:
+    """Return the detector for a station's bench; in benchmark mode a run ends with the first success."""
+    return SuccessDetector(around.truth, clock, 0.0 if spec.deployment.lockstep.benchmark else REST_S)
 
 
 def in_process_peers(
@@ -73,12 +84,20 @@ def in_process_peers(
         raise SetupError(
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
-    leader = AttachedLeader(made.robot, clock, demonstrator(made.robot, made.deployment.task, options.seed))
-    link = InProcessNode(Node(made.robot, options, clock, around), made.robot, clock, leader.update)
+    options.as_given = made.deployment.lockstep.benchmark
+    node = Node(made.robot, options, clock, around)
+    if made.deployment.collection is None:  # nobody leads, and some robots have no arm that could
+        link, policy = InProcessNode(node, made.robot, clock), make_policy
+    else:
+        leader = AttachedLeader(
+            made.robot, clock, demonstrator(made.robot, made.deployment.task, options.seed)
+        )
+        link = InProcessNode(node, made.robot, clock, leader.update)
+        policy = partial(make_policy, leader=lambda spec, clock: leader)
     return Peers(
         source=lambda spec, clock: make_source(spec, clock, lambda *of: link),
         sink=lambda spec, clock: link,
-        policy=partial(make_policy, leader=lambda spec, clock: leader),
+        policy=policy,
     )
 
 
@@ -93,7 +112,8 @@ def station(
 ) -> ServedLockstep:
     """Return the station of a deployment with its bench; `bench_options` are options of a simulated node.
 
-    If `paced`, virtual time runs at most as fast as real time, and the success of the task does not end a run.
+    If `paced`, virtual time runs at most as fast as real time, and the success of the task does not end a run, except
+    in benchmark mode.
 
     Raises:
         RuntimeFault: If the deployment is invalid, or its bench is not possible.
@@ -109,8 +129,9 @@ def station(
     options = node_parser().parse_args(arguments)
     around = environments.make_environment(spec.robot, options)
     peers = in_process_peers(spec, clock, around, options)
-    over = (lambda running: "") if paced else SuccessDetector(around.truth, clock)
-    return ServedLockstep(spec, clock, over, peers=peers, paced=paced)
+    detector = success_detector(spec, around, clock)
+    ends = not paced or spec.deployment.lockstep.benchmark
+    return ServedLockstep(spec, clock, detector if ends else lambda running: "", peers=peers, paced=paced)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -105,6 +105,13 @@ def parser() -> argparse.ArgumentParser:
         help="flat keys, as its own server's option of this name",
     )
     groot.add_argument("--token-env", metavar="NAME", help="environment variable with the API token it wants")
+    lab = line.add_argument_group("xpolicylab")
+    lab.add_argument(
+        "--single-arm-joints",
+        choices=["arm_joint_state", "joint_state"],
+        default="arm_joint_state",
+        help="how it calls the joints of a single arm",
+    )
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     program.add_arguments(line)
     return line
@@ -204,6 +211,16 @@ def _starvla(robot: Robot, rate: float, script: Script, options: argparse.Namesp
     return StarvlaServer(robot, star, options.port, script)
 
 
+def _xpolicylab(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
+    from runtime.standins.xpolicylab_server import XpolicylabBehaviour, XpolicylabServer
+
+    latency = options.latency_ms / 1e3
+    lab = XpolicylabBehaviour(
+        options.horizon, rate, latency, options.fault, options.seed, single=options.single_arm_joints
+    )
+    return XpolicylabServer(robot, lab, options.port, script)
+
+
 def _lerobot(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
     try:
         from runtime.standins.lerobot_server import LerobotBehaviour, LerobotServer
@@ -223,6 +240,7 @@ _PROTOCOLS: dict[str, Callable[[Robot, float, Script, argparse.Namespace], Stand
     "roboarena": _roboarena,
     "vllm": _roboarena,
     "starvla": _starvla,
+    "xpolicylab": _xpolicylab,
 }
 
 

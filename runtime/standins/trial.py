@@ -30,7 +30,7 @@ from runtime.processes.lockstep import lockstep
 from runtime.simulation import environments
 from runtime.simulation.node import parser as node_parser
 from runtime.standins import serve
-from runtime.standins.lockstep import PATIENT, SuccessDetector, bench_of, in_process_peers
+from runtime.standins.lockstep import PATIENT, bench_of, in_process_peers, success_detector
 from runtime.station.checks import check_deployment
 
 _ORDERS = ("setup", "run")
@@ -110,7 +110,7 @@ def run_trial(options: argparse.Namespace, orders: Mapping[str, dict[str, Any]])
             float(orders["run"].get("duration_s", _LONGEST_S)) + _MARGIN_S,
             in_process_peers(spec, clock, around, node_options),
             clock,
-            SuccessDetector(around.truth, clock),
+            success_detector(spec, around, clock),
             orders,
         )
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 _LATE = 3.0  # [s] default delay of the fault "late_reply"
 Frames = str | bytes
-Answering = Callable[[str | bytes], Frames]
+Answering = Callable[[str | bytes], Frames | None]
+"""Function of a request: its answer, None to leave it unanswered."""
 
 
 class WebsocketServer(ABC):
@@ -37,6 +38,7 @@ class WebsocketServer(ABC):
     """
 
     says_well = False  # whether GET /healthz is answered with 200
+    speaks_first = True  # whether a connection begins with a frame of the server's
 
     def __init__(self, name: str, fault: Fault, port: int = 0, idle: float | None = None) -> None:
         self._name = name
@@ -103,7 +105,7 @@ class WebsocketServer(ABC):
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             if self._fault.name == "text_first":
                 connection.send("the checkpoint could not be loaded")
-            elif self._fault.name != "mute_on_connect":
+            elif self.speaks_first and self._fault.name != "mute_on_connect":
                 first = self.greeting()
                 connection.send(first if first is not None else self.refusal())
                 if first is None:
@@ -134,6 +136,8 @@ class WebsocketServer(ABC):
                 reply = answer(request)
             except Exception as error:  # any error of a policy is reported to the client
                 return self.failed(connection, error, request)
+        if reply is None:
+            return True
         if self._fault.name == "mute_on_infer" and number >= self._fault.number(0):
             return True
         if not self._send(connection, reply, number):

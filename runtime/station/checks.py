@@ -43,12 +43,29 @@ def check_deployment(resolved: Resolved) -> StationSpec:
     collection.check(settings.collection, spec.cameras)
     _check_publication(spec)
     _check_collection(spec)
-    if settings.safety.report_only and spec.capabilities.moves_robot:
+    if settings.lockstep.benchmark:
+        _check_benchmark(spec)
+    elif settings.safety.report_only and spec.capabilities.moves_robot:
         raise SetupError(
             f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "
-            "report-only is for transports that cannot (dataset)"
+            "report-only is for transports that cannot (dataset), and for lockstep.benchmark"
         )
     return spec
+
+
+def _check_benchmark(spec: StationSpec) -> None:
+    """Check that the robot's numbers reach the bench of a benchmark as they are."""
+    robot, dims = spec.robot, spec.dims
+    for kind, changed in (
+        ("binary grippers", dims.switched),
+        ("joints that turn without end", dims.wrapping),
+    ):
+        if changed:
+            names = ", ".join(robot.joint_names[dim] for dim in changed)
+            raise SetupError(
+                f"lockstep.benchmark = true: {names} of {robot.name} are {kind}, whose numbers are changed on the way "
+                "to the bench; allowed: none (grippers.NAME.binary = false), or lockstep.benchmark = false"
+            )
 
 
 def _check_collection(spec: StationSpec) -> None:

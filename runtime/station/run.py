@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from runtime.benches.environments import describe_program
 from runtime.core.git_revision import revision
 from runtime.core.machine import installed_versions, processor
 from runtime.ipc.messages import Mode
@@ -158,6 +159,7 @@ class Provenance:
             "configuration_hash": self.spec.resolved.digest,
             "versions": self.versions,
             "processor": processor(),
+            **describe_program(self.spec.capabilities.bench),
             "git": dict(self.git),
             "asked_wall": time.time(),
         }

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 
 import robots
 from robots import Robot
+from runtime.benches.schema import load_schema
 from runtime.config import loader
 from runtime.config.loader import Resolved
 from runtime.config.schema import Deployment
@@ -56,7 +57,14 @@ class StationSpec:
 
     @property
     def layout(self) -> SharedStateLayout:
-        return SharedStateLayout(self.robot.dim, self.robot.eef_dim, self.cameras)
+        bench = self.capabilities.bench
+        program = load_schema(bench).program if bench else None
+        return SharedStateLayout(
+            self.robot.dim,
+            self.robot.eef_dim,
+            self.cameras,
+            vector=program.observation if program else 0,
+        )
 
     @property
     def limits(self) -> Limits:

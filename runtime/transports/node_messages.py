@@ -15,7 +15,7 @@ from pydantic import ConfigDict, JsonValue, TypeAdapter, ValidationError
 
 from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError
-from runtime.core.types import EEF_WIDTH, Float32, UInt8
+from runtime.core.types import EEF_WIDTH, Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -58,6 +58,7 @@ class NodeFrame:
 
     `stamp` is in the node's own clock [s], pictures are in the `encoding` of the node. `truth` is the ground truth of a
     simulated bench, as JSON. `drives` is {"enabled": bool, "faults": [str]}, or None if the node does not report it.
+    `environment_state` is a benchmark's own observation vector, whose width its bench declares.
     `remarks` are (fault, text) of optional parts that were dropped as unusable.
     """
 
@@ -72,6 +73,7 @@ class NodeFrame:
     status: NodeStatus
     truth: Mapping[str, Any] | None = None
     drives: Mapping[str, Any] | None = None
+    environment_state: Float64 | None = None
     remarks: tuple[tuple[str, str], ...] = ()
 
 
@@ -101,6 +103,9 @@ class NodeMessages:
             status=_status(message),
             truth=self._optional(remarks, "truth", _truth, message.get("truth")),
             drives=self._optional(remarks, "drives", _drives, message.get("drives")),
+            environment_state=self._optional(
+                remarks, "environment_state", _state_vector, message.get("environment_state")
+            ),
             remarks=tuple(remarks),
         )
 
@@ -199,6 +204,19 @@ def _vector(name: str, value: object, width: int) -> Float32:
     if not np.isfinite(vector).all():
         raise MessageRefused("not_finite", f"{name} has {vector.tolist()}; expected finite numbers")
     return vector
+
+
+def _state_vector(name: str, value: object) -> Float64:
+    if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.ndim != 1:
+        kind = (
+            f"{value.dtype.str} {list(value.shape)}"
+            if isinstance(value, np.ndarray)
+            else type(value).__name__
+        )
+        raise MessageRefused("malformed", f"{name} is {kind}; expected a float64 vector")
+    if not np.isfinite(value).all():
+        raise MessageRefused("malformed", f"{name} has numbers that are not finite")
+    return value
 
 
 def _picture(key: str, value: object) -> UInt8:

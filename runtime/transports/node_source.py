@@ -393,6 +393,7 @@ def _observation(
         reported_action_eef=frame.action_eef,
         truth=frame.truth,
         drives=frame.drives,
+        environment_state=frame.environment_state,
     )
 
 

@@ -100,4 +100,4 @@ def source(config: Config, robot: Robot, clock: Clock) -> NodeSource:
 
 def sink(config: Config, robot: Robot, clock: Clock) -> NodeSink:
     """Create the sink of commands to the node."""
-    return NodeSink(config.pub_endpoint, robot, clock)
+    return NodeSink(config.pub_endpoint, robot, clock, config.simulated)

@@ -46,7 +46,12 @@ export class Positions {
     this.#part("thumbnails").addEventListener("click", (event) => this.#pressed(event));
     this.#part("position").addEventListener("input", (event) => this.#typed(event.target));
     this.#part("position").addEventListener("click", (event) => event.target.closest("[data-take-away]") && this.#taken(event.target.closest("[data-thing-row]").dataset.thingRow));
-    this.#part("factors").innerHTML = Object.entries(bench.factors).map(([key, factor]) => this.#factor(key, factor)).join("");
+    const choices = Object.entries(bench.choices).map(([key, choice]) => this.#choice(key, choice));
+    const factors = Object.entries(bench.factors).map(([key, factor]) => this.#factor(key, factor));
+    this.#part("factors").innerHTML = [...choices, ...factors].join("");
+    // A bench with a program of its own has nothing to lay out.
+    for (const part of document.querySelectorAll("[data-laid-out]")) part.hidden = bench.program;
+    this.#part("factors-box").open = choices.length > 0;
     for (const [id, act] of Object.entries({
       "add-position": () => this.#added(),
       "remove-position": () => this.#removed(),
@@ -144,6 +149,10 @@ export class Positions {
       field.readOnly = this.#still;
       if (field !== document.activeElement) field.value = value ?? "";
     }
+    for (const field of this.#part("factors").querySelectorAll("select")) {
+      field.value = one.bench?.choices?.[field.dataset.choice] ?? this.#bench.choices[field.dataset.choice].usual;
+      field.disabled = this.#still;
+    }
     this.#part("factors-box").open ||= Object.keys(one.bench?.factors ?? {}).length > 0;
     for (const id of ["add-thing", "add-kind", "remove-position"]) if (this.#part(id)) this.#part(id).disabled = this.#still;
     const all = things(one.bench, this.#bench);
@@ -177,6 +186,11 @@ export class Positions {
     return `<label class="field small"><span class="label">${escaped(FACTORS[key] ?? title)}</span><input type="number" data-factor="${key}" min="${low}" max="${high}" step="${step}" placeholder="${usual}"></label>`;
   }
 
+  #choice(key, { title, values }) {
+    const options = values.map((value) => `<option>${escaped(value)}</option>`);
+    return `<label class="field small"><span class="label">${escaped(title)}</span><select data-choice="${key}">${options.join("")}</select></label>`;
+  }
+
   #laid(bench) {
     this.#one.bench = bench;
     this.#numbers(false);
@@ -187,7 +201,8 @@ export class Positions {
   }
 
   #typed(field) {
-    const { position, number, factor } = field.dataset;
+    const { position, number, factor, choice } = field.dataset;
+    if (choice) this.#laid({ ...this.#one.bench, choices: { ...this.#one.bench?.choices, [choice]: field.value } });
     if (factor && field.validity.valid) {
       const { [factor]: _, ...others } = this.#one.bench?.factors ?? {};
       const factors = field.value === "" ? others : { ...others, [factor]: Number(field.value) };

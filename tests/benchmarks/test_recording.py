@@ -185,7 +185,7 @@ def test_long_is_refused_where_there_is_nothing_longer(
     monkeypatch.setattr("sys.argv", ["benchmarks", "ik", "--long"])
     with pytest.raises(SystemExit):
         command_line.main()
-    assert "--long is for chaos and designs and recording" in capsys.readouterr().err
+    assert "--long is for chaos and designs and peers_sim and recording" in capsys.readouterr().err
 
 
 @pytest.mark.django_db

@@ -59,7 +59,7 @@ def test_rounds_are_joined_before_percentiles_are_taken() -> None:
 
 def test_every_protocol_is_shown_three_pictures_and_fourteen_joints() -> None:
     names = [protocol.name for protocol in wires_policies.protocols(PIPER)]
-    assert names == ["openpi", "roboarena", "starvla", "gr00t", "lerobot"]
+    assert names == ["openpi", "roboarena", "starvla", "xpolicylab", "gr00t", "lerobot"]
     assert set(names) <= variants("runtime.policies").keys()
     shown = wires_policies.observation(PIPER)
     assert [picture.shape for picture in shown.pictures.values()] == [(224, 224, 3)] * 3

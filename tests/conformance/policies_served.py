@@ -20,6 +20,7 @@ from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from runtime.standins.serve import StandInServer
 from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.xpolicylab_server import XpolicylabBehaviour, XpolicylabServer
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 SIZE = (48, 64)  # of the pictures of `seen`
@@ -118,6 +119,17 @@ WEBSOCKETS = {
             "statistics": {"low": list(FRANKA.lower), "high": list(FRANKA.upper)},
         },
         first=1,
+    ),
+    "xpolicylab": Served(
+        "xpolicylab",
+        "ws",
+        lambda fault: XpolicylabServer(FRANKA, XpolicylabBehaviour(fault=fault)),
+        settings={
+            "cameras": {"cam_high": "cam_head", "cam_left_wrist": "cam_wrist"},
+            "heartbeat_every": 0,
+            "reset_deadline": 0.3,
+        },
+        first=2,  # a hello and a reset
     ),
 }
 PROTOCOLS = WEBSOCKETS | {

@@ -21,7 +21,7 @@ from runtime.policies.groot import arrays as groot
 from runtime.simulation.command_gate import AcceptedCommand, CommandGate
 from runtime.standins import arrays
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeFrame, NodeMessages
-from tests.conformance.test_recorded_bytes import MNP, NPY, OPENPI, PICKLED_ACTIONS, vector
+from tests.conformance.test_recorded_bytes import MNP, NPY, OPENPI, PICKLED_ACTIONS, XPOLICYLAB, vector
 from tests.examples import some
 
 ROBOT = robots.load_robot("ur5e")
@@ -117,7 +117,9 @@ class Reading(NamedTuple):
 
 READERS = {
     "openpi": Reading(msgpack_arrays.unpack, [vector(name) for name in OPENPI]),
-    "gr00t": Reading(lambda data: groot.unpack(data, 2**20), [vector(name) for name in (*NPY, *MNP)]),
+    "gr00t": Reading(
+        lambda data: groot.unpack(data, 2**20), [vector(name) for name in (*NPY, *MNP, *XPOLICYLAB)]
+    ),
     "lerobot_message": Reading(messages.decode_actions, [messages.encode_setup(vector(PICKLED_ACTIONS[0]))]),
     "lerobot_pickle": Reading(
         lambda data: pickles.load_actions(data, 2**20), [vector(name) for name in PICKLED_ACTIONS]

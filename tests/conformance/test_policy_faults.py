@@ -29,7 +29,7 @@ from tests.processes import PATIENCE_S, eventually, joined
 from tests.runtime.policies.peers import seen, serving
 
 DEADLINE = 0.4  # s, where only a deadline ends the waiting; else what is wrong is noticed at once
-WAITING = {"mute_on_connect", "mute_on_infer", "late_reply"}
+WAITING = {"mute_on_connect", "mute_on_infer", "late_reply", "request_id"}
 Faults = dict[str, tuple[type[PolicyError], str]]
 
 WEBSOCKET: Faults = {
@@ -76,6 +76,19 @@ STARVLA = {key: value for key, value in WEBSOCKET.items() if key != "exception"}
     "refused": (PolicyError, "CUDA out of memory"),
     "request_id": (PolicyError, "request"),
 }
+XPOLICYLAB = {key: value for key, value in WEBSOCKET.items() if key != "two_batches"} | {
+    "mute_on_connect": (PolicyTimeout, "did not send an answer to hello within"),
+    "wrong_dim": (PolicyError, r"'arm_joint_state' of step 0 has the shape \[6\]; this robot needs \[7\]"),
+    "nan": (PolicyError, "action 'arm_joint_state' has nan at row 3, column 2"),
+    "two_batches": (PolicyError, "step 0 of actions is a list"),
+    "bad_array_dialect": (PolicyError, "openpi dialect"),
+    "refused": (PolicyError, "infer_failed: CUDA out of memory"),
+    "request_id": (PolicyTimeout, "did not send an answer to infer within"),
+    "malformed": (PolicyError, "not the XPolicyLab protocol"),
+    "missing_key": (PolicyError, "has no arm_joint_state"),
+    "unknown_key": (PolicyError, "the unexpected gripper"),
+    "delta_key": (PolicyError, "the unexpected delta_ee_pose"),
+}
 FAULTS: dict[str, Faults] = {
     "openpi": WEBSOCKET,
     "roboarena": WEBSOCKET,
@@ -86,6 +99,7 @@ FAULTS: dict[str, Faults] = {
     },
     "starvla": STARVLA | {"normalized": (PolicyError, "normali")},
     "starvla-old": STARVLA | {"empty": (PolicyError, "normalized_actions is empty")},
+    "xpolicylab": XPOLICYLAB,
     "gr00t-n1.5": {key: value for key, value in GR00T.items() if key != "two_batches"},
     "gr00t-n1.6": GR00T,
     "gr00t-n1.7": GR00T,
@@ -180,7 +194,7 @@ def test_every_protocol_plays_every_fault_or_says_why_it_cannot() -> None:
     assert {"text_first", "http_404"} <= set(WEBSOCKET)
 
 
-@pytest.mark.parametrize("name", WEBSOCKETS)
+@pytest.mark.parametrize("name", [name for name in WEBSOCKETS if name != "xpolicylab"])
 @pytest.mark.parametrize(("fault", "rows"), [("batched", None), ("single_row", 1)])
 def test_one_batch_and_one_row_are_understood(name: str, fault: str, rows: int | None) -> None:
     """Rows of the other protocols come in one form."""
@@ -316,7 +330,7 @@ def test_a_port_that_says_nothing_times_out(name: str) -> None:
             policy.connect()
 
 
-@pytest.mark.parametrize("name", ["gr00t-n1.6", "lerobot", "starvla", "roboarena"])
+@pytest.mark.parametrize("name", ["gr00t-n1.6", "lerobot", "starvla", "roboarena", "xpolicylab"])
 def test_conditioning_is_refused_where_the_server_would_not_know_it(name: str) -> None:
     served = protocol(name)
     given = Conditioning(np.zeros((3, served.robot.dim), np.float32), 1, 1, 3)
@@ -339,7 +353,9 @@ def test_two_clients_at_one_server_get_their_own_answers(name: str) -> None:
                 assert served.begins_at(other, value + 0.1)
 
 
-@pytest.mark.parametrize("server", ["openpi", "roboarena", "vllm", "starvla", "gr00t-n1.6", "lerobot"])
+@pytest.mark.parametrize(
+    "server", ["openpi", "roboarena", "vllm", "starvla", "xpolicylab", "gr00t-n1.6", "lerobot"]
+)
 @on_every_protocol
 def test_a_server_of_another_protocol_is_named_or_refuses_to_answer(name: str, server: str) -> None:
     """No client takes rows from a server that it does not understand."""

@@ -22,6 +22,7 @@ from runtime.policies.groot import arrays as groot
 from runtime.policies.rtc.async_rtc import AsyncRtc
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.standins import arrays as stand_in
+from runtime.standins import gr00t_wire
 from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served
 from tests.runtime.policies.peers import answering, seen, serving
@@ -43,6 +44,7 @@ OPENPI = [
 ]
 NPY = ["gr00t_n16_get_action_request", "gr00t_n16_get_action_reply"]
 MNP = ["gr00t_n17_get_action_request_mnp", "gr00t_n17_get_action_reply_mnp"]
+XPOLICYLAB = ["xpolicylab_infer_request", "xpolicylab_infer_reply", "xpolicylab_error"]  # arrays as in MNP
 CONFIGURATIONS = ["gr00t_n17_modality_config", "starvla_gr00t_contract"]
 PICKLED_ACTIONS = ["lerobot_timed_actions_clones", "lerobot_timed_actions_views", "lerobot_real_server_reply"]
 # What our client writes; tests/runtime/policies/async_inference holds that it does.
@@ -74,6 +76,7 @@ def test_every_recorded_message_is_among_these() -> None:
         *OPENPI,
         *NPY,
         *MNP,
+        *XPOLICYLAB,
         *CONFIGURATIONS,
         "starvla_gr00t_get_action_reply",
         *PICKLED_ACTIONS,
@@ -99,6 +102,14 @@ def test_gr00ts_arrays_are_the_same_in_both_forms(npy: str, mnp: str) -> None:
     assert same(read, groot.unpack(vector(mnp), LIMIT))
 
 
+@pytest.mark.parametrize("name", XPOLICYLAB)
+def test_xpolicylabs_messages_are_the_same_for_the_client_and_for_the_stand_in(name: str) -> None:
+    read = groot.unpack(vector(name), LIMIT)
+    written = vector(name) if name != "xpolicylab_infer_reply" else groot.pack(read, mnp=True)
+    assert groot.pack(read, mnp=True) == written  # its reply has a numpy scalar, which becomes a number
+    assert same(read, gr00t_wire.unpacked(written, npy=False))
+
+
 @pytest.mark.parametrize("name", PICKLED_ACTIONS)
 def test_lerobots_actions_are_read(name: str) -> None:
     actions = pickles.load_actions(vector(name), LIMIT)
@@ -113,7 +124,7 @@ def test_lerobots_requests_are_no_actions(name: str) -> None:
         pickles.load_actions(vector(name), LIMIT)
 
 
-@pytest.mark.parametrize("name", [*OPENPI, *NPY, *MNP])
+@pytest.mark.parametrize("name", [*OPENPI, *NPY, *MNP, *XPOLICYLAB])
 def test_a_message_cut_anywhere_is_refused(name: str) -> None:
     recorded = vector(name)
     unpack: Callable[[bytes], Any] = (

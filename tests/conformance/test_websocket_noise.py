@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from websockets.sync.server import ServerConnection
 
 from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyError
 from runtime.core.plugins import variants
+from runtime.policies.groot import arrays as mnp
+from runtime.policies.xpolicy.envelope import Request
 from tests.conformance.policies_served import WEBSOCKETS
 from tests.examples import some
 from tests.runtime.policies.peers import FRANKA, serving
@@ -35,6 +38,14 @@ def _pieces() -> st.SearchStrategy[bytes]:
             {"status": "ok", "ok": True, "request_id": "infer-2", "data": {"actions": np.zeros((1, 2, 8))}}
         ),
         msgpack_arrays.pack(np.zeros((2, 8), np.float32)),
+        mnp.pack(
+            {
+                "message_type": "infer_result",
+                "message_id": "m1",
+                "payload": {"actions": [{"arm_joint_state": np.zeros(7), "ee_joint_state": np.zeros(1)}]},
+            },
+            mnp=True,
+        ),
     ]
     cut = st.sampled_from(real).flatmap(lambda m: st.integers(0, len(m) - 1).map(lambda n: m[:n]))
     turned = st.tuples(st.sampled_from(real), st.integers(0, 10_000), st.integers(1, 255)).map(
@@ -43,7 +54,7 @@ def _pieces() -> st.SearchStrategy[bytes]:
     return st.one_of(st.binary(max_size=64), cut, turned)
 
 
-@pytest.mark.parametrize("kind", ["openpi", "roboarena", "starvla"])
+@pytest.mark.parametrize("kind", ["openpi", "roboarena", "starvla", "xpolicylab"])
 @settings(max_examples=some(60))
 @given(payload=_pieces())
 def test_bytes_without_sense_are_a_policy_error_and_never_a_crash(kind: str, payload: bytes) -> None:
@@ -69,6 +80,10 @@ def _read(policy: Any, kind: str, payload: bytes) -> np.ndarray:
     if kind == "roboarena":
         return np.asarray(policy._meant.chunk(policy._value(payload, "an answer"), {}).actions)
     reply = policy._decode(payload, "an answer")
+    if kind == "xpolicylab":
+        asked = Request("infer", "eva-web", {}, number="m1")
+        asked.is_answered_by(reply)
+        return np.asarray(policy._layout.rows(asked.read(reply).get("actions")))
     policy._check_reply(reply, {"request_id": "infer-2"})
     return np.asarray(policy._chunk(reply.get("data"), 1.0).actions)
 
@@ -104,8 +119,13 @@ def test_metadata_without_sense_are_a_policy_error_or_understood(kind: str, meta
 
 @pytest.mark.parametrize("name", WEBSOCKETS)
 def test_a_server_that_sends_noise_first_is_the_wrong_protocol(name: str) -> None:
+    def noise(connection: ServerConnection) -> None:
+        connection.send(b"\xc1\xc1")
+        for _ in connection:  # until the client leaves
+            pass
+
     with (
-        serving(lambda connection: connection.send(b"\xc1\xc1")) as url,
+        serving(noise) as url,
         WEBSOCKETS[name].policy(url) as policy,
         pytest.raises(PolicyError, match="protocol"),
     ):

@@ -22,6 +22,10 @@ from tests.evaweb.console.page import Page
 from tests.processes import eventually
 
 MARKS = ("execution_horizon", "something_new", '"targets"')  # only the live socket has them
+CRATES = (
+    *("imported-crate", "imported-crate-file", "imported-crate-remove"),
+    *("api:imported-crate", "api:imported-crate-file"),
+)
 ROUNDS = 4  # of what the live socket is given to tell
 STREAMS = ["state", "joints", "recent", "poses", "chunk", "camera/cam_high"]
 
@@ -47,7 +51,10 @@ def addresses(lab):
         "format": {"": ["table", "mcap-video"]},
         "index": {"": [0]},
         "robot": {"": ["agilex_piper"]},
-        "digest": {"": [(lab.plan.at_reveal or {}).get("digest", "0" * 64)]},
+        "digest": {
+            "": [(lab.plan.at_reveal or {}).get("digest", "0" * 64)],
+            **{name: [lab.crate.sha256] for name in CRATES},
+        },
         "checkpoint": {"": KEYS},
         "rest": {"": ["nowhere"]},
         "file": {"": ["eva-diagnosis-20260101-000000.zip"]},
@@ -107,6 +114,8 @@ def crawled(lab, client, queries=(), *, posts=False, uncovers=True):
     Each kind of page is asked for one thing that it answers for, and for all where it answers for none; with `posts`
     those that are only posted to are sent nothing, without `uncovers` but a reveal and a look.
     """
+    for address in files(lab):
+        yield address, *answered(client, address)
     wanted = WANTED.format(lab.dataset, *KEYS, KEYS[0], lab.episode.uuid if lab.episode else "")
     for choices in addresses(lab):
         for address in choices:
@@ -124,6 +133,12 @@ def crawled(lab, client, queries=(), *, posts=False, uncovers=True):
             for query in queries if LIST.search(address) else ():
                 yield address + query, *answered(client, address + query, {"HX-Request": "true"})
             break
+
+
+def files(lab):
+    """Addresses of files that have to be told a licence."""
+    plan = [lab.plan.name, lab.plan.version]
+    yield from (f"{reverse(name, args=plan)}?license=MIT" for name in ("result-crate", "api:plan-crate"))
 
 
 def answered(client, address, headers=None):

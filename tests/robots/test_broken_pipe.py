@@ -17,7 +17,7 @@ from robots.broken_pipe import EXIT_BROKEN_PIPE, EXIT_WRITE_ERROR, exit_on_broke
 from tests.runtime.datasets.small import record
 
 ROOT = Path(__file__).parents[2]
-# What has its own standard output, or none: the processes of a station, of a tunnel, of a benchmark, ROS's Python.
+# What has its own standard output, or none: the processes of a station, of a tunnel, of a benchmark or bench, ROS's.
 NOT_OF_A_TERMINAL = {
     "runtime.processes.control.process",
     "runtime.processes.guard.process",
@@ -36,6 +36,8 @@ NOT_OF_A_TERMINAL = {
     "benchmarks.wires_receiver",
     "evaweb.serving.computations",
     "evaweb.results.reports.recompute.__main__",  # stands alone in a report
+    "runtime.benches.host",  # in a bench's own environment
+    "runtime.benches.metaworld.experts",
 }
 
 

@@ -19,6 +19,7 @@ _LEFT_OUT = {  # entries of the data folder that are recreated at the next start
     "broker",
     "cache",
     "diagnosis",
+    "environments",
     "jobs",
     "lab.lock",
     "logs",
@@ -30,6 +31,7 @@ _LAST = "archived"
 _LEFT_OUT_ANYWHERE = {
     "bus.key",
     "endpoints",
+    "foxglove.token",
     "panel.pin",
 }  # of a station: recreated, see docs/administrator.md
 _TRIES = 3

@@ -49,7 +49,8 @@ class AttemptRecord:
 
     `match` is the smallest agreement of a camera's image with its reference at the last bench check before the run;
     `override` is the reason for which a low match was accepted. `worker` is the copy of a simulated station that ran
-    it, None for a trial of a person: nobody checks cameras of a copy, and copies run at the same time.
+    it, None for a trial of a person: nobody checks cameras of a copy, and copies run at the same time. `benchmark` is
+    True if the bench waited for the policy and got its rows as they were.
     """
 
     number: int
@@ -74,6 +75,7 @@ class AttemptRecord:
     warm_up: float | None
     latency: float | None
     worker: str | None = None
+    benchmark: bool = False
     ended: str = ""
 
     @property
@@ -115,6 +117,7 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Benc
         "deviations": _deviations(runs, list(given_back.values("at", "text", by_name=F("by__username")))),
         "operators": balance(runs, "operator"),
         "stations": balance(runs, "station"),
+        "benchmark": [sum(run.benchmark for run in runs if run.counts), sum(run.counts for run in runs)],
         "machines": balance([run for run in runs if run.worker], "machine"),
         "cameras": _cameras(plan, runs),
         "bench": _bench(plan, runs, looks),
@@ -160,15 +163,21 @@ def all_attempts(plan: Plan, looks: Iterable[BenchImage]) -> list[AttemptRecord]
     voided = ("reason", "voided_at", "voided_by__username")
     rows, accepted = needed_handouts(plan).order_by("number"), _accepted(looks)
     delays_of = ("trial__setup_took", "trial__episode__policy")
-    end_fields = (*delays_of, "trial__ended_by", "trial__episode__status", "trial__worker")
+    end_fields = (
+        *delays_of,
+        "trial__ended_by",
+        "trial__episode__status",
+        "trial__worker",
+        "trial__truth__benchmark",
+    )
     attempts = []
     named = [f"trial__{name}" for name in (*own, *voided)]
     for row in rows.values_list(*fields, *named, *end_fields):
-        *plain, took, policy, stored_end, recording, worker = row
+        *plain, took, policy, stored_end, recording, worker, benchmark = row
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
         match = accepted.get(row[fields.index("trial_id")], (None, ""))
-        attempt = AttemptRecord(*plain, *match, *delays, worker)
+        attempt = AttemptRecord(*plain, *match, *delays, worker, bool(benchmark))
         told_now = attempt.status == TrialStatus.VOIDED and stored_end is None  # its reason is a person's
         attempts.append(
             attempt

@@ -14,6 +14,7 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
+from evaweb.accounts.profiles import orcids_of
 from evaweb.accounts.roles import Role, role_of
 from evaweb.blinding.visibility import visibility_for_request
 from evaweb.core.errors import EvaError
@@ -24,6 +25,10 @@ from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis.simulated import compare_with_real, is_simulated, simulated_plans
+from evaweb.results.crates.download import MOST_PICTURES, crate_response
+from evaweb.results.crates.facts import crate_facts
+from evaweb.results.crates.licenses import LICENSES
+from evaweb.results.crates.options import LONGEST, CrateOptions
 from evaweb.results.pages import pages
 from evaweb.results.pages.draft import planned_facts
 from evaweb.results.presentation import listings
@@ -47,9 +52,6 @@ PER_PAGE = 50
 PLANS_PER_PAGE = 25
 MOST_LINES = 200  # lines per list on the integrity page; REST and the report have all
 _FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
-MOST_PICTURES = (
-    32_000_000  # [bytes] of images in a report that is packed in memory; the command has no such limit
-)
 
 
 @require_GET
@@ -150,6 +152,35 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
         content_type="application/zip",
         headers={"Content-Disposition": f'attachment; filename="{title}.zip"'},
     )
+
+
+@require_GET
+def crate(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
+    """Render the choices of a crate of the results; with a licence among the query's parameters, return the crate."""
+    plan = _get_plan(name, version)
+    sealed = _sealed_page(request, plan)
+    if sealed:
+        return sealed
+    typed = {field: request.GET.get(field, "") for field in ("license", "date", *LONGEST)}
+    videos, fault = request.GET.get("videos") == "true", None
+    if typed["license"]:
+        try:
+            return crate_response(request, request.user, plan, CrateOptions(**typed, videos=videos))
+        except EvaError as refused:
+            fault = refused
+    facts = crate_facts(plan)
+    people = sorted({facts.owner, *facts.operators, *facts.raters})
+    orcids = orcids_of(people)
+    context = {
+        **_common(request, plan),
+        "typed": typed | {"videos": videos},
+        "longest": LONGEST,
+        "licenses": LICENSES,
+        "day": f"{facts.recorded_at:%Y-%m-%d}",
+        "people": [(person, orcids.get(person, "")) for person in people],
+        "fault": fault,
+    }
+    return render(request, "results/crate.html", context, status=fault.status if fault else 200)
 
 
 @require_GET

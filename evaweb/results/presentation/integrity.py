@@ -113,6 +113,12 @@ def _departures(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"{_of(len(deviations[name]), 'block')} {label}"
     if deviations["out_of_turn"]:
         yield f"{_of(len(deviations['out_of_turn']), 'trial')} handed out of turn"
+    made, of = document["benchmark"]
+    if made:
+        yield (
+            f"In benchmark mode, where the bench waits for the policy and a run ends with the first success: {made} of "
+            f"{of} trials"
+        )
     machines = [row["name"] for row in document["machines"]["rows"]]
     if len({name.rpartition(" ")[2] for name in machines}) > 1:
         counts = ", ".join(f"{row['name']} {sum(row['trials'])}" for row in document["machines"]["rows"])

@@ -23,6 +23,7 @@ from evaweb.results.analysis.arm import COLUMNS as ARM_COLUMNS
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import time_courses
+from evaweb.results.presentation.drawings.svg import restart_numbering
 from evaweb.results.presentation.figures import draw_arms
 from evaweb.results.presentation.integrity import delays_banner
 from evaweb.results.presentation.plan_result import PlanResult
@@ -56,13 +57,16 @@ MOST_LINES = 1000  # lines per list on the report's page; its data are complete
 _PROGRAM = Path(__file__).parent / "recompute"
 
 
-def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> Path:
+def write_report(
+    plan: Plan, out: Path, *, most_pictures: int | None = None, written_at: datetime | None = None
+) -> Path:
     """Write the report to the new folder `out`, and return its first page.
 
     Args:
         plan: A plan that is frozen or later.
         out: Folder, created if it does not exist.
         most_pictures: Limit of bench images [bytes]; None for all.
+        written_at: Time that the report states; None for the present.
 
     Raises:
         EvaError: If the folder is not empty, or the plan is a draft.
@@ -87,8 +91,10 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
     (out / "recompute" / "page.css").write_text(_styles(), "utf-8")
     page = out / "index.html"
-    context = {
-        **report_context(result),
+    with restart_numbering():
+        context = report_context(result)
+    context |= {
+        **({"made": written_at} if written_at else {}),
         "record": result.conduct,
         "banner": delays_banner(result.conduct),
         "most": MOST_LINES,

@@ -106,6 +106,7 @@ def export_links(plan: Plan, only: TrialFilter) -> SafeString:
     query = f"&{only.query}" if only.query else ""
     links = [(f"{address}?format={kind}{query}", label) for kind, label in _FORMATS]
     links.append((reverse("result-report", args=[plan.name, plan.version]), "Report, offline"))
+    links.append((reverse("result-crate", args=[plan.name, plan.version]), "RO-Crate"))
     return format_html("{}", format_html_join(" ", '<a href="{}">{}</a>', links))
 
 

@@ -112,7 +112,7 @@ class Watch:
 
     def _follow(self) -> None:
         """Receive the streams until the page has not been used for `_LOOKED_AT_S`."""
-        state, cameras = _Ear(self._context, "state"), _Ear(self._context, "camera/")
+        state, cameras = StreamReader(self._context, "state"), StreamReader(self._context, "camera/")
         searched_at = -float("inf")
         try:
             while not self._ended.is_set() and self._clock() - self._looked < _LOOKED_AT_S:
@@ -136,7 +136,7 @@ class Watch:
         return self._endpoints.address(process, socket)
 
 
-class _Ear:
+class StreamReader:
     """Subscription to a stream, which follows the stream's endpoint if that changes."""
 
     def __init__(self, context: zmq.Context[Any], stream: str) -> None:
@@ -145,6 +145,7 @@ class _Ear:
         self._subscriber: Subscriber | None = None
 
     def turn_to(self, place: str) -> None:
+        """Read the stream at this endpoint from now on; "" reads nothing."""
         if place == self._place:
             return
         if self._subscriber is not None:
@@ -153,12 +154,19 @@ class _Ear:
         self._subscriber = Subscriber(self._context, place, self._stream) if place else None
 
     def receive(self, seconds: float) -> dict[str, Any]:
+        """Return the newest content by stream, waiting at most `seconds`; {} without any, or if it is unreadable."""
         if self._subscriber is None:
             time.sleep(seconds)
             return {}
         with suppress(CodecError):
             return self._subscriber.receive(seconds)
         return {}
+
+    def receive_all(self) -> list[tuple[str, Any]]:
+        """Return (stream, content) of every message that has arrived, in order; [] if one is unreadable."""
+        with suppress(CodecError):
+            return [] if self._subscriber is None else self._subscriber.receive_all(0.0)
+        return []
 
 
 def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,10 +192,10 @@ def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
 def _reason(snapshot: Mapping[str, Any]) -> str:
     reason = str(snapshot.get("reason") or "")
     sentence = (snapshot.get("sentences") or {}).get("reason")
-    return reason if not reason or _open(sentence) else _ELSEWHERE
+    return reason if not reason or is_shown(sentence) else _ELSEWHERE
 
 
-def _open(sentence: Any) -> bool:
+def is_shown(sentence: Any) -> bool:
     """Return True if the panel may display a sentence, because it reveals nothing of a policy that a blind plan hides.
 
     The ids of the sentence and of all sentences in its arguments must begin with a permitted group.
@@ -195,4 +203,4 @@ def _open(sentence: Any) -> bool:
     if not isinstance(sentence, Mapping) or str(sentence.get("id")).split(".")[0] not in _SHOWN:
         return False
     within = sentence.get("arguments") or {}
-    return all(_open(value) for value in within.values() if isinstance(value, Mapping))
+    return all(is_shown(value) for value in within.values() if isinstance(value, Mapping))

@@ -1,8 +1,8 @@
 """Msgpack dialects of GR00T: arrays as numpy files (NPY), or in the form of the package msgpack_numpy (MNP).
 
 NPY, used by N1.5 and N1.6: a map of `__ndarray_class__` true and `as_npy`, the bytes of a .npy file. MNP, used by N1.7:
-a map of `nd`, `type`, `kind`, `shape`, `data` with binary keys. N1.7 reads both, its early access only MNP. Nothing is
-ever unpickled here.
+a map of `nd`, `type`, `kind`, `shape`, `data` with binary keys. N1.7 reads both, its early access only MNP, which is
+XPolicyLab's form, too. Nothing is ever unpickled here.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _decode(fields: dict[Any, Any]) -> object:
     if any(mark in fields for mark in (b"__ndarray__", "__ndarray__", b"__npgeneric__")):
         raise CodecError(
             "found an array in the openpi dialect ('__ndarray__'); expected NPY ('__ndarray_class__') or MNP ('nd'): "
-            "the peer speaks another protocol than GR00T's"
+            "the peer speaks another protocol than the one configured"
         )
     return fields
 

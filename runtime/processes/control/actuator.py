@@ -12,7 +12,7 @@ import numpy as np
 from runtime.config.schema import FaultResponse
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern, fixed, series
-from runtime.core.types import Float32, Float64, RobotCommand
+from runtime.core.types import ControlSource, Float32, Float64, RobotCommand
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.motion.timeline import DimensionKinds, difference
@@ -101,8 +101,8 @@ class Actuator(ABC):
         """
 
     @abstractmethod
-    def _deliver(self, step: int, action: Float64) -> float:
-        """Send `action` to the robot; return the time at which it was sent."""
+    def _deliver(self, step: int, action: Float64, source: ControlSource) -> float:
+        """Send `action`, which is of this source, to the robot; return the time at which it was sent."""
 
     def engage(self, measured: Float64) -> None:
         """Engage the robot at its measured position: from now on a command is sent on every tick.
@@ -197,7 +197,7 @@ class Actuator(ABC):
                 True,
             )
         action, corrected = self._checked(action, elapsed, stop)
-        time = self._deliver(step, action)
+        time = self._deliver(step, action, "estop" if stop else target.source)
         self.velocity = (action - self.commanded) / elapsed
         if self._switching:
             self.velocity[self._settings.limits.binary] = 0.0
@@ -286,10 +286,10 @@ class RobotActuator(Actuator):
             return LimitedCommand(action)
         return self._limiter(action, self.commanded, self.velocity, elapsed, stop)
 
-    def _deliver(self, step: int, action: Float64) -> float:
+    def _deliver(self, step: int, action: Float64, source: ControlSource) -> float:
         now = self._clock()
         eef = None if self._settings.publication is None else self._settings.publication(action)
-        self._sink.send(RobotCommand(action.astype(np.float32), step, now, eef))
+        self._sink.send(RobotCommand(action.astype(np.float32), step, now, eef, source))
         return now
 
 
@@ -313,5 +313,5 @@ class SimulatedActuator(Actuator):
             previous_target=aim,
         )
 
-    def _deliver(self, step: int, action: Float64) -> float:
+    def _deliver(self, step: int, action: Float64, source: ControlSource) -> float:
         return self._clock()

@@ -77,7 +77,8 @@ class Peers:
 class Lockstep:
     """Station without processes; each `tick` runs reception, media, coordinator and control in that order.
 
-    Pass the clock, the environment `around` and `peers` to let other code, for example a simulator, take part.
+    Pass the clock, the environment `around` and `peers` to let other code, for example a simulator, take part. In
+    benchmark mode a run is over as soon as the observation shows it, before the policy is asked about it.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class Lockstep:
         self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
         self._over = around.over
+        self._benchmark = settings.lockstep.benchmark
         self._runner = around.runner or LockstepRunner(self.delayed)
         self.coordinator = assemble(spec, self.shared, clock, self._runner, around.client_clock, peers.policy)
         self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
@@ -111,8 +113,13 @@ class Lockstep:
 
     def tick(self) -> None:
         """Run one control period; if the source's run is over, the station's run ends within this period."""
-        if reason := self._over(self.coordinator.session.state is SessionState.RUNNING):
-            self.coordinator.end_source_run(reason)
+        self._observe()
+        self._act()
+
+    def _observe(self) -> None:
+        """Run the first part of a control period: receive an observation, and ask the policy if it is time."""
+        if not self._benchmark:
+            self._end_if_over()
         now = self.clock.now()
         for process in ("control", "guard", "reception", "media"):
             self.shared.beat(process, now)
@@ -121,11 +128,23 @@ class Lockstep:
         self.media.poll()
         if self.reception.poll_commands():  # a run begins with its source, in this tick
             self.media.poll()
+        if self._benchmark:
+            self._end_if_over()
         self.coordinator.poll()
-        self._tick(self.step, now)
+
+    def _act(self) -> None:
+        """Run the second part of a control period: send the robot its command."""
+        self._tick(self.step, self.clock.now())
         self._runner.tick()
         self.step += 1
         self._advance_clock()
+
+    def _end_if_over(self) -> None:
+        if reason := self._over(self.coordinator.session.state is SessionState.RUNNING):
+            if self._benchmark:  # what was reached by the last row belongs to the run
+                self.reception.report()
+                self.coordinator.inbox.poll()
+            self.coordinator.end_source_run(reason)
 
     def delayed(self, result: Any) -> tuple[Any, int]:
         """Return what a call to the policy returned, a response with its declared latency, and its delay [ticks].

@@ -80,7 +80,8 @@ class ServedLockstep(Lockstep):
         self._exports = ExportQueue(settings.data, settings.recording.export)
         start_repair(settings.episodes_dir, settings.station, self._exports.submit)
         self._previews = Previews(spec)
-        self._asking = DeclaredRunner(self.delayed)
+        self._asking = DeclaredRunner(self.delayed, least=0 if settings.lockstep.benchmark else 1)
+        self._observed = False  # benchmark mode: a control period waits for the policy, between its two parts
         around = LockstepEnvironment(
             runner=self._asking,
             client_clock=self._people,
@@ -109,7 +110,9 @@ class ServedLockstep(Lockstep):
         wait = _POLL_S
         if not self._is_paused():
             now = self._people.now()
-            if self._is_unpaced():
+            if self._observed:
+                self._finish_tick()
+            elif self._is_unpaced():
                 wait = 0.0
                 self.tick()
             elif now >= self._next_at:
@@ -121,9 +124,20 @@ class ServedLockstep(Lockstep):
         self._estops.serve(0.0)
 
     def tick(self) -> None:
-        """Run one control period."""
-        super()._advance_clock()
-        super().tick()
+        """Run one control period; in benchmark mode only up to the request, if its policy is still computing."""
+        if not self._observed:
+            super()._advance_clock()
+            self._observe()
+            self._observed = self._benchmark and self._asking.busy
+            if self._observed and self._asking.start_waiting():
+                return  # a policy that has answered already needs no wait
+        self._finish_tick()
+
+    def _finish_tick(self) -> None:
+        if self._observed:
+            self._observed = False
+            self.coordinator.poll()  # the response is for this period
+        self._act()
         self._figures.add(0.0, 0)
         if self.step % _FIGURES_EVERY == 0:
             self._figures.write()
@@ -135,6 +149,8 @@ class ServedLockstep(Lockstep):
         """
         self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
         self.tick()
+        if self._observed:  # a stop does not wait for the policy
+            self._finish_tick()
 
     def _advance_clock(self) -> None:
         """Do nothing: time advances at the start of a tick, since the policy is queried between ticks."""
@@ -148,7 +164,11 @@ class ServedLockstep(Lockstep):
         """
         if self._asking.start_waiting() or self.media.closing:
             return True
-        if self._paced or self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
+        if (
+            self._paced
+            or self._observed
+            or self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY)
+        ):
             return False
         moving = bytes(self.shared.control.read()["behaviour"]) == b"motion"
         return not (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -250,7 +251,8 @@ class Media:
         try:
             # With its present pictures: those of an earlier observation may be overwritten before they are read.
             if (newest := self._shared_state.read_observation(self._shared_state.layout.cameras)) is not None:
-                self._recorder.add_observation(newest)
+                same = newest.sequence == self._newest  # shared state has no ground truth
+                self._recorder.add_observation(replace(newest, truth=self._truth or None) if same else newest)
             identity, path = self._recorder.begin(manifest, run)
         except (RecordingError, TornReadError) as fault:
             return EpisodeOpened(run, "", "", str(fault))

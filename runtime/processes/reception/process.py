@@ -70,6 +70,7 @@ class Reception:
         self._intake = ObservationReceiver(shared, source, clock, self._emit, self._hand_on)
         self._begun: RunBegun | None = None  # media has not been informed yet
         self._next_report = 0.0
+        self._milestones: Any = None  # of the simulated bench, as last reported
         self._missed = 0  # observations for which media had no room
         for _ in shared.rings["source"].drain():
             pass  # addressed to a predecessor that died
@@ -97,7 +98,10 @@ class Reception:
         self._emit(Event("scheduling", text, self._clock.now()))
 
     def _report_in_time(self) -> None:
-        if self._clock.now() >= self._next_report:
+        """Send a report if it is due, or if a milestone of a simulated bench has changed: its time counts."""
+        milestones = self._intake.truth.get("milestones")
+        if self._clock.now() >= self._next_report or milestones != self._milestones:
+            self._milestones = milestones
             self.report()
 
     def poll_commands(self) -> bool:

@@ -32,6 +32,7 @@ class ResetRequest:
     seed: int
     positions: Mapping[str, Any] | None = None
     factors: Mapping[str, Any] | None = None
+    choices: Mapping[str, Any] | None = None
 
 
 class BlockTable(ABC):

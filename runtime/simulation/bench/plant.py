@@ -19,7 +19,8 @@ class Plant:
     """Joints `q` float64 [D] of a robot; they start at home, or at `start`, and move towards `target` [D].
 
     On a bench with contact forces, `reference` [D] is the position at which the drives aim; forces keep `q` slightly
-    away from it. It is None if the joints are exactly where the drives aim.
+    away from it. It is None if the joints are exactly where the drives aim. `row` [D] is the newest row of a policy or
+    leader until a bench that advances by rows has executed it.
     """
 
     def __init__(self, robot: Robot, lag: float = LAG, start: Float64 | None = None) -> None:
@@ -28,6 +29,7 @@ class Plant:
         self.q: Float64 = (robot.poses["home"] if start is None else start).copy()
         self.target: Float64 = self.q.copy()
         self.reference: Float64 | None = None
+        self.row: Float64 | None = None
 
     def advance(self, seconds: float) -> None:
         """Advance by `seconds`: the joints approach the target with a first-order lag, within their velocity limits."""

@@ -60,7 +60,12 @@ def test_a_wrong_token_is_refused_even_beside_a_session(bench, token):
 def test_a_browser_needs_its_csrf_token_to_change_something_and_none_to_read(bench):
     browser = Client(enforce_csrf_checks=True)
     browser.force_login(bench.operator)
-    assert browser.get("/api/v1/me").json() == {"username": "ann", "name": "", "role": "operator"}
+    assert browser.get("/api/v1/me").json() == {
+        "username": "ann",
+        "name": "",
+        "role": "operator",
+        "orcid": "",
+    }
     body = json.dumps({"scene": "block-on-plate", "position": 1, "checkpoint": "pi0-block"})
     where = reverse("api:prepare", args=["bench-1"])
     refused = browser.post(where, body, content_type="application/json")

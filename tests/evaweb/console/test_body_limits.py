@@ -13,6 +13,7 @@ from django.conf import settings
 
 from evaweb.console.body_limits import ANONYMOUS_LIMIT, USER_LIMIT, body_bound
 from evaweb.plans.references import LARGEST
+from evaweb.results.crates.limits import MOST_UPLOAD
 from evaweb.serving.headers import DEFAULT_HEADERS
 from tests.evaweb.console.test_serve import MANAGE, served
 from tests.processes import PATIENCE_S
@@ -36,6 +37,7 @@ HUGE = 200_000_000
         (b"/api/v1/nowhere", SESSION, False, 64 * 1024, 413),
         (b"/result/trials/1/score", SESSION, False, USER_LIMIT, 413),
         (b"/admin/plans/plan/import/", SESSION, False, LARGEST + ANONYMOUS_LIMIT, 413),
+        (b"/result/crates/import", SESSION, False, MOST_UPLOAD + ANONYMOUS_LIMIT, 413),
         (b"/admin/plans/plan/import/", [], True, USER_LIMIT, 413),
         (b"/admin/plans/plan/import/", [], False, ANONYMOUS_LIMIT, 413),
         (b"/api/v1/stations/bench-1/estop", [], False, ANONYMOUS_LIMIT, 0),

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+import robots
 from evaweb.episodes import services
 from evaweb.episodes.job_kinds import find_unmeasured_episodes
 from evaweb.episodes.manifest_robot import robot_for
@@ -124,6 +125,10 @@ def test_who_cannot_be_measured_says_why(real):
     assert "robot 'nobody' does not exist" in smoothness_of(moving(real, angles, robot=unknown)).why
     other = {**real.manifest["robot"], "dim": 3}
     assert "3 joints" in smoothness_of(moving(real, angles, robot=other)).why
+    hand = robots.load_robot("metaworld")
+    groups = [{"name": group.name} for group in hand.groups]
+    armless = {"name": hand.name, "groups": groups, "dim": hand.dim, "joint_names": list(hand.joint_names)}
+    assert "metaworld has no arm" in smoothness_of(moving(real, angles, robot=armless)).why
 
 
 @pytest.mark.django_db

@@ -51,3 +51,19 @@ def test_a_station_keeps_its_title_when_its_deployment_is_started_again():
     )
     again = demo_rows.station_registered(name="bench-1", **(facts | {"deployment": "b.toml"}))
     assert (again.title, again.deployment) == ("The red table", "b.toml")
+
+
+def test_the_scene_of_a_benchmark_s_task_has_its_choice_and_what_counts_as_success():
+    parts = {"bench": "metaworld", "task": "door-open-v3", "time_limit_s": 10.0, "pictures": "plain"}
+    scene = demo_rows.benchmark_scene(**parts)
+    assert (scene.name, scene.bench, scene.instruction) == (
+        "metaworld-door-open-v3",
+        "metaworld",
+        "door-open-v3",
+    )
+    assert [row.bench for row in scene.positions.all()] == [
+        {"choices": {"task": "door-open-v3", "pictures": "plain"}}
+    ]
+    assert [(row.truth, row.required) for row in scene.milestones.all()] == [("success", True)]
+    scene.milestones.all().delete()
+    assert not demo_rows.benchmark_scene(**parts).milestones.exists(), "an administrator's change stays"

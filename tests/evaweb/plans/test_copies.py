@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import threading
 import time
 from datetime import timedelta
@@ -20,6 +22,7 @@ from evaweb.plans.allocation import allocate_trial, plan_progress, release_slots
 from evaweb.plans.design import ENDED_EVENT, dropped_of, findings_of
 from evaweb.plans.models import Handout, Plan
 from evaweb.plans.services import freeze_plan
+from evaweb.plans.trial_processes import TrialProcess
 from evaweb.results.analysis.conduct import all_attempts
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation.integrity import integrity_document
@@ -144,6 +147,19 @@ def test_machines_of_several_kinds_are_counted_and_said(bench, monkeypatch):
     Trial.objects.filter(handout__number__lt=4).update(worker=f"{plan.pk}.1 gpu-1 00000000")
     (text,) = [text for text in integrity_document(plan)["remarks"] if "several kinds" in text]
     assert text.endswith(f"gpu-1 00000000 3, {machine} 5")
+
+
+def test_trials_in_benchmark_mode_are_counted_and_said(bench, monkeypatch):
+    def in_benchmark_mode(trial):
+        made = result(trial)
+        made["events"][1]["data"]["benchmark"] = trial.handout.number < 4
+        return made
+
+    plan = plan_of(bench)
+    Processes(monkeypatch, in_benchmark_mode)
+    carry_out(bench, plan, 1)
+    (text,) = [text for text in integrity_document(plan)["remarks"] if "benchmark mode" in text]
+    assert text.endswith("ends with the first success: 3 of 8 trials")
 
 
 @pytest.mark.parametrize("count", [1, 4])
@@ -413,8 +429,21 @@ def test_a_process_that_hangs_is_ended(bench, monkeypatch):
     plan = plan_of(bench)
     monkeypatch.setattr(farm, "_LONGEST_S", 0.2)
     monkeypatch.setattr(farm, "_SLOWEST", 0.0)
-    monkeypatch.setattr(farm.sys, "executable", "/bin/sh")
-    monkeypatch.setattr(farm, "_PROGRAM", ("-c", "exec sleep 1000"))
+
+    def hanging(arguments, log, variables):
+        log.touch()
+        child = subprocess.Popen(["sleep", "1000"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        status, reported = os.pipe()
+        os.write(reported, f"{child.pid}\n".encode())
+
+        def report():
+            os.write(reported, f"{child.wait()}\n".encode())
+            os.close(reported)
+
+        threading.Thread(target=report).start()
+        return TrialProcess(status, os.dup(child.stdin.fileno()), os.dup(child.stdout.fileno()))
+
+    monkeypatch.setattr(farm.PROCESSES, "start", hanging)
     request(bench, plan)
     job = claim(queue="copies", owner=OWNER)
     with pytest.raises(EvaError, match=r"failed \(-9\)"):

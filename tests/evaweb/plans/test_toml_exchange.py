@@ -34,6 +34,17 @@ def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
     assert document_of(Plan.objects.get(pk=draft.pk), KEY) == before
 
 
+def test_choices_travel_as_well(draft, admin):
+    laid = {"choices": {"task": "reach-v3", "pictures": "plain"}}
+    Scene.objects.update(bench="metaworld")
+    Position.objects.update(bench=laid)
+    text = export_toml(plans=[draft])
+    draft.delete()
+    Scene.objects.all().delete()
+    import_file(user=admin, text=text)
+    assert Position.objects.get(number=1).bench == laid
+
+
 def test_factors_travel_as_well(draft, admin):
     Position.objects.filter(number=1).update(bench={"block": [0.1, 0.3, 0], "factors": {"light": 0.5}})
     text = export_toml(plans=[draft])

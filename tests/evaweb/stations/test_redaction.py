@@ -37,7 +37,8 @@ TRUTH = {"reset": "a", "objects": {"block": [0.1, 0.2]}, "milestones": {"lifted"
 
 
 def test_of_the_benchs_truth_what_was_reached_is_left_out():
-    shown = redaction.redact_state({"state": "ready", "truth": TRUTH}, FULL_VISIBILITY)
+    told = TRUTH | {"over": "success", "steps": 7}
+    shown = redaction.redact_state({"state": "ready", "truth": told}, FULL_VISIBILITY)
     assert shown["truth"] == {"reset": "a", "objects": {"block": [0.1, 0.2]}}
 
 

@@ -6,6 +6,7 @@ from evaweb.trials.tables import (
     check_bench_name,
     check_policy,
     check_strategy,
+    example_layout,
     layout_problems,
     simulated_bench,
 )
@@ -137,8 +138,21 @@ def test_a_layout_is_compared_with_one_simulated_bench(bench, sentence):
 def test_another_bench_has_other_objects():
     assert layout_problems({"red_1": [0, 0.3, 0], "blue_bin": [-0.08, 0.22]}, load_schema("sorting")) == []
     check_bench_name("sorting")
-    with pytest.raises(ValidationError, match="allowed: sorting, tabletop, or the path"):
+    with pytest.raises(ValidationError, match="allowed: metaworld, sorting, tabletop, or the path"):
         check_bench_name("moon")
+
+
+def test_a_bench_with_a_program_of_its_own_has_choices_and_no_objects():
+    schema = load_schema("metaworld")
+    assert example_layout(schema) == {"choices": {"task": "reach-v3", "pictures": "as published"}}
+    assert layout_problems({"choices": {"task": "door-open-v3"}}, schema) == []
+    assert layout_problems({"choices": {"task": "door-open-v2"}, "block": [0, 0, 0]}, schema) == [
+        "block: unknown key; allowed: objects, factors, choices",
+        "choices.task = 'door-open-v2'; allowed: door-open-v3, door-close-v3, window-open-v3, drawer-open-v3, "
+        "door-lock-v3 and 45 more",
+    ]
+    with pytest.raises(ValidationError, match="choices = 3; allowed: a table"):
+        check_bench({"choices": 3})
 
 
 def test_a_simulated_bench_lays_what_is_its_own():

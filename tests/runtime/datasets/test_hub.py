@@ -25,6 +25,7 @@ class Client:
         self.refuses = ""
         self.has = Path()
         self.size = 10  # of each file [bytes]
+        self.tags: list[str] = []
 
     def create_repo(self, name: str, **given: Any) -> str:
         if self.refuses:
@@ -58,6 +59,12 @@ class Client:
         sizes = [SimpleNamespace(rfilename=file, size=self.size) for file in self.files]
         return SimpleNamespace(sha="abc123", siblings=sizes)
 
+    def list_repo_refs(self, name: str, *, repo_type: str) -> SimpleNamespace:
+        return SimpleNamespace(tags=[SimpleNamespace(name=tag) for tag in self.tags])
+
+    def delete_tag(self, name: str, **given: Any) -> None:
+        self.asked.append(("untag", {"name": name, **given}))
+
     def create_tag(self, name: str, **given: Any) -> None:
         self.asked.append(("tag", {"name": name, **given}))
 
@@ -82,10 +89,16 @@ def test_a_dataset_is_uploaded_privately_and_tagged_with_its_version(client: Cli
     (_, made), (_, sent), (_, card), (_, tagged) = client.asked
     assert (made["name"], made["private"], made["repo_type"]) == ("lab/cups", True, "dataset")
     assert (sent["repo_id"], sent["folder_path"]) == ("lab/cups", dataset)
-    assert (tagged["tag"], tagged["exist_ok"]) == ("v2.1", True)
+    assert tagged["tag"] == "v2.1"
     assert told[-1] == "the files are uploaded"
     assert (card["path_in_repo"], card["repo_id"], card["repo_type"]) == ("README.md", "lab/cups", "dataset")
     assert b"# cups\n" in card["path_or_fileobj"]
+
+
+def test_the_tag_of_an_earlier_upload_is_replaced(client: Client, dataset: Path) -> None:
+    client.tags = ["v2.1"]
+    hub.push(dataset, "lab/cups")
+    assert [name for name, _ in client.asked] == ["create", "upload", "card", "untag", "tag"]
 
 
 def test_a_card_of_ones_own_is_uploaded_as_it_is(client: Client, dataset: Path) -> None:

@@ -25,7 +25,7 @@ REFUSED = {
         SetUpRequest,
         {"bench": {"seed": 1, "positons": {"block": [0.0, 0.3, 0.0]}}},
         "say: bench.positons = {'block': [0.0, 0.3, 0.0]}: unknown key (did you mean positions?); "
-        "allowed here: factors, id, of, positions, schema_digest, seed",
+        "allowed here: choices, factors, id, of, positions, schema_digest, seed",
     ),
     "no table": (SetUpRequest, {"policy": "openpi"}, "say: policy = 'openpi': must be a table"),
     "no seed": (SetUpRequest, {"bench": {}}, "say: bench.seed is missing"),

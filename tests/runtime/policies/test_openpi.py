@@ -33,7 +33,7 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Conditioning, Observation
 from runtime.policies import openpi
 from runtime.policies.openpi import Config, OpenpiPolicy
-from runtime.policies.websocket_link import WebsocketLink, error_headline
+from runtime.policies.websocket_link import CLOSING, WebsocketLink, error_headline
 from runtime.simulation.scripts.pose_script import PoseScript
 from runtime.simulation.scripts.script import WavingScript
 from runtime.standins.faults import NONE, TOO_LARGE, Fault
@@ -958,6 +958,19 @@ def test_a_link_that_was_aborted_before_it_opened_says_so() -> None:
         link.abort()
         with pytest.raises(PolicyError, match="closed from our side"):
             link.open()
+
+
+@pytest.mark.parametrize("farewell", [None, b"farewell"])
+def test_leaving_a_server_that_does_not_read_ends_and_holds_up_no_process(farewell: bytes | None) -> None:
+    with not_reading_server() as url:
+        link = WebsocketLink(url, {}, 10.0)
+        link.open()
+        assert link._connection is not None
+        with contextlib.suppress(BlockingIOError):
+            while True:  # until the wire takes nothing more
+                link._connection.socket.send(bytes(65536), socket.MSG_DONTWAIT)
+        link.close_gracefully(farewell)
+        joined(*(thread for thread in threading.enumerate() if thread.name == CLOSING))
 
 
 def test_a_closed_policy_does_not_connect_by_itself_but_when_asked() -> None:

@@ -217,14 +217,15 @@ def test_a_recorded_episode_has_no_further_ones(tmp_path: Path) -> None:
         policy.connect()
 
 
-def test_the_actions_of_another_robot_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("other", ["ur5e", "metaworld"])  # one that is shipped, and one of a bench
+def test_the_actions_of_another_robot_are_refused(tmp_path: Path, other: str) -> None:
     episode = record(tmp_path / "episodes", frames=FRAMES)
     manifest = json.loads((episode / "manifest.json").read_text())
-    manifest["robot"]["name"] = "ur5e"
+    manifest["robot"]["name"] = other
     (episode / "manifest.json").write_text(json.dumps(manifest))
     resealed(episode)
     policy = replay.build(Config(path=str(episode)), robot(), VirtualClock(), FPS)
-    with pytest.raises(PolicyError, match="is of the robot ur5e, the station's is small"):
+    with pytest.raises(PolicyError, match=f"is of the robot {other}, the station's is small"):
         policy.connect()
 
 

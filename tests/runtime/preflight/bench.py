@@ -54,6 +54,12 @@ def _starvla(old: bool) -> Callable[[Fault], Any]:
     return lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, size=SIZE, old=old))
 
 
+def _xpolicylab(fault: Fault) -> Any:
+    from runtime.standins.xpolicylab_server import XpolicylabBehaviour, XpolicylabServer
+
+    return XpolicylabServer(FRANKA, XpolicylabBehaviour(fault=fault))
+
+
 def _gr00t(version: Any) -> Callable[[Fault], Any]:
     from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 
@@ -72,6 +78,11 @@ ARENA = {
     "reset_deadline": 5.0,
 }
 STARVLA = {"kind": "starvla", "cameras": CAMERAS, "ping_every": 0}
+XPOLICYLAB = {
+    "kind": "xpolicylab",
+    "cameras": {"cam_high": "cam_head", "cam_left_wrist": "cam_wrist"},
+    "heartbeat_every": 0,
+}
 STATISTICS = {"low": list(FRANKA.lower), "high": list(FRANKA.upper)}
 GROOT = {"kind": "gr00t", "video": VIEWS, "state": PARTS, "actions": PARTS}
 LEROBOT = {
@@ -87,6 +98,7 @@ WIRES = {
     "vllm": Wire(ARENA, _arena("vllm")),
     "starvla": Wire(STARVLA, _starvla(old=False)),
     "starvla-old": Wire({**STARVLA, "statistics": STATISTICS}, _starvla(old=True)),
+    "xpolicylab": Wire(XPOLICYLAB, _xpolicylab),
     "gr00t-n1.5": Wire({**GROOT, "dialect": "n1.5"}, _gr00t("n1.5"), PIPER, None),
     "gr00t-n1.6": Wire({**GROOT, "dialect": "nested"}, _gr00t("n1.6"), PIPER, None),
     "gr00t-n1.7-early": Wire(GROOT, _gr00t("n1.7-early"), PIPER, None),

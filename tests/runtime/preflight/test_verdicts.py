@@ -17,9 +17,9 @@ from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.runtime.policies.peers import PIPER
 from tests.runtime.preflight.bench import HURRIED, WIRES, flown, planned, served
 
-WEBSOCKETS = ("openpi", "roboarena", "vllm", "starvla")
+WEBSOCKETS = ("openpi", "roboarena", "vllm", "starvla", "xpolicylab")
 GROOTS = ("gr00t-n1.5", "gr00t-n1.6")
-WAITING = ("mute_on_connect", "mute_on_infer", "late_reply")  # faults that only a deadline ends
+WAITING = ("mute_on_connect", "mute_on_infer", "late_reply", "request_id")  # faults that only a deadline ends
 
 EVERYWHERE = {
     "mute_on_connect": ("timeout", "protocol"),
@@ -75,6 +75,15 @@ OWN = {
         "normalized": ("wrong_action_space", "space"),
         "refused": ("server_error", "infer"),
     },
+    "xpolicylab": {
+        "exception": ("server_error", "protocol"),  # of the hello already
+        "refused": ("server_error", "infer"),
+        "malformed": ("wrong_protocol", "infer"),
+        "missing_key": ("bad_shape", "shape"),
+        "unknown_key": ("bad_shape", "shape"),
+        "delta_key": ("wrong_action_space", "space"),
+        "request_id": ("timeout", "infer"),
+    },
     "lerobot": {
         "exception": ("server_error", "infer"),
         "malformed": ("wrong_protocol", "infer"),
@@ -94,9 +103,10 @@ def faults_of(name: str) -> dict[str, tuple[str, str]]:
         found |= ON_WEBSOCKETS
     if name in GROOTS:
         found |= OF_GROOT
-    if name == "starvla":  # whose first request is a ping
+    before = {"starvla": 1, "xpolicylab": 2}.get(name, 0)  # a ping; a hello and a reset
+    if before:
         found = {
-            key.replace(":1", ":2").replace(":0", ":1"): what
+            key.replace(":1", f":{1 + before}").replace(":0", f":{before}"): what
             for key, what in found.items()
             if key != "late_reply:4"
         }
@@ -193,8 +203,8 @@ def test_a_gr00t_server_that_wants_a_token_refuses() -> None:
     assert "secret" not in str(report.to_dict())
 
 
-@pytest.mark.parametrize("server", ["openpi", "roboarena", "starvla", "gr00t-n1.6"])
-@pytest.mark.parametrize("client", ["openpi", "roboarena", "starvla", "gr00t-n1.6", "lerobot"])
+@pytest.mark.parametrize("server", ["openpi", "roboarena", "starvla", "xpolicylab", "gr00t-n1.6"])
+@pytest.mark.parametrize("client", ["openpi", "roboarena", "starvla", "xpolicylab", "gr00t-n1.6", "lerobot"])
 def test_the_server_of_another_protocol_is_never_taken_for_well(client: str, server: str) -> None:
     if client == server:
         return

@@ -25,7 +25,7 @@ from runtime.simulation.bench.bench import Bench, camera_arm
 from runtime.simulation.bench.block_table import BlockTable, ResetRequest
 from runtime.simulation.bench.plant import Plant
 from runtime.simulation.bench.tabletop import Tabletop
-from runtime.simulation.environments import Environment
+from runtime.simulation.environment import Environment
 from runtime.simulation.node import parser
 from runtime.simulation.render import Renderer
 from runtime.simulation.scripts.pick_place import PickPlace, Skill, poses_apart

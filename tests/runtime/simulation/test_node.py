@@ -422,7 +422,9 @@ def test_a_layout_that_cannot_be_is_refused_and_changes_nothing(tabletop: Bench)
     tabletop.send(target="scene_reset", id="one", seed=3, positions={"plate": [3.0, 0.3]})
     said = tabletop.tick()
     assert said["refused"] == {"bench_layout": 1}
-    assert said["truth"] == before
+    refused = said["truth"].pop("refused")
+    assert (refused["id"], said["truth"]) == ("one", before)
+    assert refused["why"].startswith("positions: plate at x 3000, y 300 mm; allowed on a simulated bench")
 
 
 def test_the_arms_over_a_bench_obey_as_without_one(tabletop: Bench) -> None:

@@ -28,6 +28,11 @@ SERVED = {
         ARENA | {"numbering": "1-based", "action_keys": ["arm", "gripper"]},
     ),
     "starvla": ("starvla", [], {"cameras": [camera.key for camera in FRANKA.cameras]}),
+    "xpolicylab": (
+        "xpolicylab",
+        ["--single-arm-joints", "joint_state"],
+        {"cameras": {"cam_high": "cam_head"}, "single_arm_joints": "joint_state"},
+    ),
 }
 
 
@@ -47,7 +52,7 @@ def policy_of(kind: str, url: str, **settings: Any) -> Any:
 def test_it_is_reached_by_its_client(name: str, serve: Any) -> None:
     protocol, arguments, settings = SERVED[name]
     url = serve(protocol, *arguments).ready["url"]
-    kind = "starvla" if protocol == "starvla" else "roboarena"
+    kind = "roboarena" if protocol == "vllm" else protocol
     with contextlib.closing(policy_of(kind, url, **settings)) as policy:
         policy.connect()
         chunk = policy.infer(seen(FRANKA))

@@ -14,11 +14,13 @@ from runtime.standins.faults import Fault
 from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.xpolicylab_server import XpolicylabBehaviour, XpolicylabServer
 from runtime.station.spec import StationSpec
 from tests.runtime.simulation.tabletop_station import HORIZON, pick_and_place, served
 
 ARENA = ['policy.kind="roboarena"', 'policy.cameras={cam_high="first", cam_wrist="wrist"}']
 STARVLA = ['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]']
+XPOLICYLAB = ['policy.kind="xpolicylab"', 'policy.cameras={cam_high="cam_head", cam_wrist="cam_wrist"}']
 SIZE = (240, 320)
 ARM = robots.load_robot("ur5e")
 LIMITS = f"{{low={list(map(float, ARM.lower))}, high={list(map(float, ARM.upper))}}}"
@@ -41,6 +43,10 @@ def starvla_server(old: bool) -> Any:
     return made
 
 
+def xpolicylab_server(spec: StationSpec, script: Script) -> XpolicylabServer:
+    return XpolicylabServer(spec.robot, XpolicylabBehaviour(HORIZON, spec.rate), 0, script)
+
+
 def rtc_server(dialect: Any) -> Any:
     def made(spec: StationSpec, script: Script) -> OpenpiServer:
         return OpenpiServer(spec.robot, Behaviour(HORIZON, spec.rate, rtc=dialect), 0, script)
@@ -60,6 +66,11 @@ TRIALS: dict[str, tuple[list[str], Any]] = {
     ),
     "starvla": (STARVLA, starvla_server(old=False)),
     "starvla-old": ([*STARVLA, f"policy.statistics={LIMITS}"], starvla_server(old=True)),
+    "xpolicylab": (XPOLICYLAB, xpolicylab_server),
+    "xpolicylab-poses": (
+        [*XPOLICYLAB, 'policy.action_space="eef"', 'policy.observation_space="eef"'],
+        xpolicylab_server,
+    ),
 }
 
 

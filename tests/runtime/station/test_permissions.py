@@ -63,6 +63,7 @@ NAMING = [
     {"api_key_env": KEY},
     {"kind": "roboarena", "api_key_env": KEY},
     {"kind": "starvla", "api_key_env": KEY},
+    {"kind": "xpolicylab", "api_key_env": KEY},
     GR00T | {"api_token_env": KEY},
     {"tunnel": {"host": "h", "identity_file": "/etc/passwd"}},
     {"tunnel": {"host": "h", "ssh_config": "~/.ssh/config"}},

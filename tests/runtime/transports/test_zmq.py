@@ -618,6 +618,15 @@ def test_a_command_has_the_fields_of_the_protocol(node: Node) -> None:
     assert heard["seq"] >= 1
 
 
+def test_a_simulated_node_is_told_whose_row_a_command_is(node: Node) -> None:
+    """A bench with a program of its own advances by the rows of a policy alone."""
+    sink = link.sink(Config(pub_endpoint=node.act, simulated=True), ROBOT, MonotonicClock())
+    with contextlib.closing(sink):
+        sink.connect()
+        row = RobotCommand(np.zeros(14, np.float32), 3, 12.5, source="policy")
+        assert send_until_heard(node, sink, row)["source"] == "policy"
+
+
 @pytest.mark.parametrize("word", ["collect_start", "collect_stop", "hil_start", "hil_stop"])
 def test_words_of_the_protocol_have_the_form_of_a_command_that_moves_nothing(node: Node, word: str) -> None:
     """Older nodes read a vector in every message, and some take any for a target."""

@@ -188,7 +188,13 @@ class Command(BaseCommand):
             )
             for row in served
         ]
-        parts = {"owner": "admin", "scene": demo_rows.demo_scene(), "checkpoints": checkpoints}
+        first, second = checkpoints
+        parts = {
+            "owner": "admin",
+            "positions": demo_rows.demo_scene().positions.all(),
+            "checkpoints": checkpoints,
+            "question": f"Does {first} put the block on the plate more often than {second}?",
+        }
         return demo_rows.demo_plan(name=name, title=title, repetitions=repetitions, **parts, **design)
 
     def _welcome(self, url: str, logins: list[DemoLogin]) -> None:

@@ -41,7 +41,8 @@ class Command(BaseCommand):
         simulated_options(parser)
 
     def handle(self, *args: Any, **options: Any) -> None:
-        benches = [Bench(path.absolute()) for path in options["deployments"]]
+        pictures = benches_of(options).options
+        benches = [Bench(path.absolute(), options=pictures) for path in options["deployments"]]
         progress = on_terminal(Lab.STEPS + len(benches))
         try:
             with open_lab(options["host"], options["port"], options["stop_port"], progress) as lab:

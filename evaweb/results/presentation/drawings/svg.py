@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from html import escape as html_escape
 from itertools import count
@@ -16,13 +18,24 @@ SERIES = 8  # series with a style of their own; further ones start again
 LINE = 15.0  # line spacing of a label
 _LETTER = 7.6  # approximate width of a character
 PROPORTION = ("successes", "trials", "rate", "low", "high")  # columns of x of n with its interval
-_numbers = count(1)
+_SHARED = count(1)  # figures of one page have different ids, whoever draws them
+_numbers: ContextVar[Iterator[int]] = ContextVar("drawing numbers", default=_SHARED)
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 def escape(text: str) -> str:
     """Return the text escaped for XML; characters that XML cannot represent, as in some old names, become U+FFFD."""
     return html_escape(_NOT_XML.sub("\ufffd", text))
+
+
+@contextmanager
+def restart_numbering() -> Iterator[None]:
+    """Number the figures that are drawn within the context from 1, so that equal documents have equal bytes."""
+    token = _numbers.set(count(1))
+    try:
+        yield
+    finally:
+        _numbers.reset(token)
 
 
 class Drawing(str):
@@ -58,7 +71,7 @@ def drawing(
         columns: Names of the columns of `rows`.
         rows: Numbers from which the figure was drawn; they are embedded as CSV.
     """
-    name = f"drawing-{next(_numbers)}"
+    name = f"drawing-{next(_numbers.get())}"
     inner = "".join(parts)
     role = "group" if "<a " in inner else "img"  # an image may not contain links
     data = "".join(iter_csv(columns, [[dict(zip(columns, row, strict=True)) for row in rows]]))

@@ -115,13 +115,13 @@ class DeclaredRunner(Runner):
     """Runner that executes calls between two ticks; a call's result is ready after a declared number of ticks.
 
     The function `declared` receives what a call returned. It returns the result of the call, and the number of ticks
-    after which that result is ready, at least one. Calls start at `start_waiting`. They run on a thread, so that the
-    ticking thread can answer commands meanwhile; no tick may pass while a call is running. Therefore the step at which
-    a result is ready does not depend on the call's real duration.
+    after which that result is ready, `least` at least. Calls start at `start_waiting`. They run on a thread, so that
+    the ticking thread can answer commands meanwhile; no tick may pass while a call is running. Therefore the step at
+    which a result is ready does not depend on the call's real duration.
     """
 
-    def __init__(self, declared: Declared) -> None:
-        self._declared = declared
+    def __init__(self, declared: Declared, least: int = 1) -> None:
+        self._declared, self._least = declared, least
         self._thread = ThreadRunner()
         self._now = 0
         self._waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
@@ -146,8 +146,9 @@ class DeclaredRunner(Runner):
         return self._thread.busy
 
     def ready(self, future: Future[Result]) -> bool:
-        # Never in the tick of the request: the number of polls within a tick is random.
-        return future.done() and self._now >= self._asked[future] + max(1, self._late.get(future, 1))
+        # With `least` 1 never in the tick of the request: the number of polls within a tick is random.
+        late = max(self._least, self._late.get(future, self._least))
+        return future.done() and self._now >= self._asked[future] + late
 
     @property
     def busy(self) -> bool:

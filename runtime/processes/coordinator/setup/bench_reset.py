@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from runtime.benches.schema import load_schema
@@ -76,7 +76,11 @@ class BenchReset:
             raise SetupError(_OTHER_BENCH(wanted=bench.of or "", own=own) + same)
         if bench.schema_digest is None and bench.of is not None and bench.of != own:
             raise SetupError(_OTHER_BENCH(wanted=bench.of, own=own))
-        problems = (*schema.problems(bench.positions or {}), *schema.factor_problems(bench.factors or {}))
+        problems = (
+            *schema.problems(bench.positions or {}),
+            *schema.factor_problems(bench.factors or {}),
+            *schema.choice_problems(bench.choices or {}),
+        )
         if problems:
             raise SetupError(_NO_LAYOUT(why=problems[0]))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
@@ -105,10 +109,14 @@ class BenchReset:
         """
         truth = self._reception().truth
         if truth.get("reset") == self._reset["id"]:
-            wanted = self._reset.get("factors") or {}
-            if truth.get("factors", {}) != wanted:
-                raise SetupError(_NO_FACTORS(factors=", ".join(wanted)))
+            for key in ("factors", "choices"):
+                wanted = self._reset.get(key) or {}
+                if truth.get(key, {}) != wanted:
+                    raise SetupError(_NO_FACTORS(factors=", ".join(wanted)))
             return True
+        unlaid = truth.get("refused")
+        if isinstance(unlaid, Mapping) and unlaid.get("id") == self._reset["id"]:
+            raise SetupError(_CANNOT_RESET(why=unlaid.get("why", "")))
         now = self._clock.now()
         if self._refused:
             raise SetupError(_CANNOT_RESET(why=self._refused))

@@ -61,6 +61,11 @@ _POLICY_WITHOUT_RTC = Pattern(
     "strategy 'rtc': the policy {policy!r} does not continue a chunk that it is given; allowed: another"
     " strategy, or a server and policy.rtc that do",
 )
+_RESAMPLED = Pattern(
+    "setup.resampled",
+    "the policy's rows are at {rate:g} Hz (policy.action_rate), and the control rate is {own:g} Hz: with "
+    "lockstep.benchmark = true no row is resampled; allowed: the control rate",
+)
 _HORIZON_TOO_LONG = Pattern(
     "setup.horizon_too_long",
     "strategy.execution_horizon = {wanted} control steps, but the policy {policy!r} says that its "
@@ -445,6 +450,8 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
     # A server that ignores the conditioning silently appears to work, but executes another method.
     if continues and info.supports_rtc is False:
         raise SetupError(_POLICY_WITHOUT_RTC(policy=info.name))
+    if spec.deployment.lockstep.benchmark and (info.rate or spec.rate) != spec.rate:
+        raise SetupError(_RESAMPLED(rate=info.rate, own=spec.rate))
     # The horizon cannot exceed the rows of a response.
     strategy = spec.deployment.strategy
     horizon, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES

@@ -34,6 +34,7 @@ from runtime.standins.faults import Fault
 from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.xpolicylab_server import XpolicylabBehaviour, XpolicylabServer
 from runtime.station.checks import check_deployment
 from tests.processes import PATIENCE_S, alive, eventually, joined
 from tests.runtime.policies.peers import PIPER, seen
@@ -170,6 +171,10 @@ PROTOCOLS: dict[str, tuple[Callable[[], Any], Callable[[str], dict[str, Any]]]] 
     "starvla": (
         lambda: StarvlaServer(PIPER, StarvlaBehaviour(size=(24, 32))),
         lambda url: {"kind": "starvla", "url": url, "cameras": list(CAMERAS)},
+    ),
+    "xpolicylab": (
+        lambda: XpolicylabServer(PIPER, XpolicylabBehaviour()),
+        lambda url: {"kind": "xpolicylab", "url": url, "cameras": {"cam_high": "cam_head"}},
     ),
 }
 
