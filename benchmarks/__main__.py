@@ -18,6 +18,7 @@ _BENCHMARKS = (
     "farm",
     "glass",
     "ik",
+    "interop",
     "lab",
     "latency",
     "live",

@@ -51,7 +51,7 @@ def measure(seconds: float, *, long: bool = False) -> Report:
     schema = load_schema(_BENCH)
     tasks = tuple(schema.choices["task"].values) if long else _TASKS
     with tempfile.TemporaryDirectory() as name:
-        kept = _results_file(schema.digest) if long else Path(name) / "episodes"
+        kept = _results_file(schema.digest) if long else Path(name) / "results.jsonl"
         ours = _run_ours(tasks, kept, Path(name))
     alone = _run_alone(tasks)
     rows = []

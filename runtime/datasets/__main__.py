@@ -1,10 +1,12 @@
-"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push|pull: LeRobot datasets."""
+"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push|pull|croissant: LeRobot datasets."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,11 @@ from runtime.datasets import layout, operations
 from runtime.datasets.assemble import AssemblyResult
 from runtime.datasets.card import LICENCES
 from runtime.datasets.consistency import check_with_remarks
+from runtime.datasets.croissant import LICENCES as DESCRIBED
+from runtime.datasets.croissant import describe_croissant
 from runtime.datasets.hub import pull, push
 from runtime.datasets.publishing import publish
+from runtime.datasets.reader import open_dataset
 
 
 @exit_on_broken_pipe
@@ -107,6 +112,17 @@ def add_commands(
     pulling.add_argument("--to", type=dataset, required=True, metavar="DIR", help="new folder of the dataset")
     pulling.add_argument("--revision", default="", help="branch, tag or commit; the newest files without")
     pulling.set_defaults(run=_pull)
+    describing = commands.add_parser(
+        "croissant", help="describe a dataset for catalogues, as Croissant JSON-LD"
+    )
+    describing.add_argument("dataset", type=dataset, help="folder of the dataset")
+    describing.add_argument("--licence", choices=DESCRIBED, required=True, help="that the description states")
+    describing.add_argument(
+        "--url", required=True, help="address of the page at which the dataset is published"
+    )
+    describing.add_argument("--name", help="the name of its folder without")
+    describing.add_argument("--description", help="in a sentence; what its files say without")
+    describing.set_defaults(run=_describe)
 
 
 _REENCODE = "where pictures cannot be copied as they are coded, code them again"
@@ -222,6 +238,19 @@ def _push(options: argparse.Namespace) -> int:
 def _pull(options: argparse.Namespace) -> int:
     pulled = pull(options.repository, options.to, revision=options.revision, tell=print)
     print(f"pulled: {len(pulled.episodes)} episodes of {options.repository} to {options.to}")
+    return 0
+
+
+def _describe(options: argparse.Namespace) -> int:
+    opened = open_dataset(options.dataset)
+    name = options.name or opened.root.resolve().name
+    words = (
+        options.description or f"{len(opened.episodes)} episodes in the format of LeRobot {opened.version}."
+    )
+    described = describe_croissant(
+        opened, name, licence=options.licence, url=options.url, description=words, published=date.today()
+    )
+    print(json.dumps(described, indent=1))
     return 0
 
 

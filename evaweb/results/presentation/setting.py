@@ -25,13 +25,15 @@ def setting_now(plan: Plan) -> str:
         groups.values_list(
             *(f"{station}{name}" for name in ("robot", "simulated", "name")),
             *(f"{verdict}{name}" for name in ("rater__username", "source")),
+            "trial__truth__benchmark",
         ).annotate(n=Count("pk"), first=Min("trial__prepared_at"), last=Max("trial__prepared_at"))
     )
     if not rows:
         return ""
     robots, stations, scorers = set(), set(), defaultdict[str, int](int)
-    for robot, simulated, at, rater, source, n, *_ in rows:
-        robots.add(f"{robot} ({'simulated' if simulated else 'real'})")
+    for robot, simulated, at, rater, source, benchmark, n, *_ in rows:
+        mode = ", in benchmark mode" if benchmark else ""
+        robots.add(f"{robot} ({'simulated' if simulated else 'real'}{mode})")
         stations.add(at)
         scorers["the simulated bench" if source == Score.Source.TRUTH else rater] += n
     count = sum(scorers.values())

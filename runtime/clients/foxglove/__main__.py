@@ -35,6 +35,7 @@ from runtime.ipc.lifeline import Lifeline
 
 log = logging.getLogger(__name__)
 _TURN_S, _FIND_S = 0.02, 0.5
+_NICENESS = 10  # whoever only looks comes after everything that moves
 _TOKEN_FILE = "foxglove.token"
 _COORDINATOR = ("state", "joints", "event")
 
@@ -176,6 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     data = Path(options.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
     logs.configure_logging("foxglove")
+    os.nice(_NICENESS)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -26,6 +26,7 @@ from evaweb.plans.trial_processes import TrialProcess
 from evaweb.results.analysis.conduct import all_attempts
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation.integrity import integrity_document
+from evaweb.results.presentation.setting import setting_now
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.services import abandon_trial, create_trial, dismiss_trial, score_trial
@@ -160,6 +161,7 @@ def test_trials_in_benchmark_mode_are_counted_and_said(bench, monkeypatch):
     carry_out(bench, plan, 1)
     (text,) = [text for text in integrity_document(plan)["remarks"] if "benchmark mode" in text]
     assert text.endswith("ends with the first success: 3 of 8 trials")
+    assert "(simulated) and agilex_piper (simulated, in benchmark mode)" in setting_now(plan)
 
 
 @pytest.mark.parametrize("count", [1, 4])

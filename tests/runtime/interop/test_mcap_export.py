@@ -22,9 +22,8 @@ from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import DiskFullError
 from runtime.recording.labels import Label, append_label
-from runtime.recording.layout import Layout
 from runtime.recording.reader import Episode, open_episode
-from runtime.recording.tables import SCHEMAS
+from tests.runtime.interop.rebuilt import STREAMS, bits, messages, rebuilt
 from tests.runtime.recording.samples import (
     CAMERAS,
     DIM,
@@ -101,19 +100,6 @@ def summary(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> McapSumma
     return export_mcap(folder, tmp_path_factory.mktemp("out") / "episode.mcap")
 
 
-def messages(path: Path) -> dict[str, list[tuple[Any, Any]]]:
-    """Each message of a file with its decoded content, by topic, as they lie in the file."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    found = defaultdict(list)
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        for _, channel, message, content in reader.iter_decoded_messages(log_time_order=False):
-            found[channel.topic].append((message, content))
-    return found
-
-
 def summary_of(path: Path) -> Any:
     from mcap.reader import make_reader
 
@@ -128,40 +114,7 @@ def stamp_of(content: Any) -> int | None:
     return None if time is None else time.sec * 10**9 + time.nanosec
 
 
-def rebuilt(name: str, layout: Layout, contents: list[Any]) -> pa.Table:
-    """A table of the episode from the messages of its topic alone."""
-    schema = SCHEMAS[name](layout)
-    columns: dict[str, list[Any]] = {field.name: [] for field in schema}
-    for content in sorted(contents, key=lambda content: content.row):
-        for column, values in columns.items():
-            group, _, stream = column.partition(".")
-            if column in content.absent:
-                values.append(None)
-            elif group == "capture_time":
-                values.append(content.capture_times[content.capture_streams.index(stream)])
-            elif stream:
-                values.append(getattr(content, group)[content.cameras.index(stream)])
-            else:
-                values.append(getattr(content, column))
-    return pa.table(columns, schema=schema)
-
-
-def bits(table: pa.Table) -> dict[str, Any]:
-    """The columns of a table with every float as the bits that it has; NaN is one pattern only."""
-
-    def plain(value: Any, kind: Any) -> Any:
-        if value is None or isinstance(value, str):
-            return value
-        if isinstance(value, list):
-            return [plain(item, kind.value_type) for item in value]
-        return np.array(value, kind.to_pandas_dtype()).tobytes()
-
-    return {f.name: [plain(value, f.type) for value in table[f.name].to_pylist()] for f in table.schema}
-
-
-@pytest.mark.parametrize(
-    ("name", "topic"), [("raw", "raw"), ("smoothed", "smoothed"), ("ticks", "executed"), ("rows", "rows")]
-)
+@pytest.mark.parametrize(("name", "topic"), STREAMS.items())
 def test_the_streams_are_rebuilt_from_messages_to_the_bit(
     folder: Path, summary: McapSummary, name: str, topic: str
 ) -> None:
