@@ -1,8 +1,9 @@
-"""Other programs: export and import of episodes as MCAP, and the live view in Foxglove beside a running robot.
+"""Other programs: episodes as MCAP, the live view in Foxglove beside a running robot, and a program that drives it.
 
 The complete demo runs. One trial has no live view; in the next, a client of `python -m runtime.clients.foxglove` has
 subscribed all topics, cameras too. Its recording is then exported, read back by packages that are not ours, and
-imported.
+imported. In a third run a program drives by `python -m runtime.clients.robot_server`, at the control rate and with all
+pictures, as LeRobot's commands do.
 
 * `export_ratio.video`, `export_ratio.jpeg`: duration of the episode times its cameras over the time of the export; with
   "video" pictures are copied, with "jpeg" coded anew.
@@ -10,22 +11,28 @@ imported.
 * `roundtrip_differences`: tables of the episode of which any column differs in any bit from the messages.
 * `bridge_share`: share of a processor that the bridge uses, `bridge_messages_per_s`: what it sends.
 * `loop_p99_ratio.bridge`: the control loop's lateness p99 with the bridge over that without.
+* `drive_observe_ms`, `drive_act_ms`: median time of the two requests of a program that drives, `..._p99` their 99th
+  percentile.
+* `drive_delay_steps`: median number of control steps from the observation that a row answers to its first place in the
+  plan. `loop_p99_ratio.drive`: as for the bridge.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import psutil
 from websockets.sync.client import ClientConnection, connect
 
@@ -34,7 +41,9 @@ from benchmarks.labs import ROOT, STATION, RunningLab, lab
 from benchmarks.report import Figure, Report
 from evaweb.lab.rest_client import LivePage, RestClient
 from evaweb.lab.single_trial import TrialChoice, start
+from runtime.clients.client import StationClient
 from runtime.clients.foxglove.server import PROTOCOL
+from runtime.integrations.evaweb_robot.evaweb_robot import Station
 from runtime.interop.bag_import import import_bags
 from runtime.interop.bag_mapping import propose_mapping
 from runtime.interop.bag_reader import Bag
@@ -50,13 +59,19 @@ def measure(seconds: float) -> Report:
         ready = folder / "ready.json"
         with lab(["manage.py", "demo", "--port", "0", "--ready-file", str(ready)], ready) as demo:
             alone = _trial(demo.visitor, seconds)
-            with _bridge(demo) as (process, address), _viewer(address) as viewer:
+            with _client(demo, "runtime.clients.foxglove") as (process, address), _viewer(address) as viewer:
                 before, begun = sum(process.cpu_times()[:2]), time.monotonic()
                 watched = _trial(demo.visitor, seconds)
                 share = (sum(process.cpu_times()[:2]) - before) / (time.monotonic() - begun)
-        episode = _newest_episode(demo.data)
+            episode = _newest_episode(demo.data)
+            with _client(demo, "runtime.clients.robot_server") as (_, address):
+                requests, driven = _drive(demo, address, seconds)
+        delay = _delay_steps(_newest_episode(demo.data), requests)
         files = _files(episode, folder)
-    lateness = [control["lateness_p99_ms"] for control in (alone, watched)]
+    lateness = [control["lateness_p99_ms"] for control in (alone, watched, driven)]
+    observing, acting = (
+        np.array([getattr(row, name) for row in requests]) for name in ("observe_ms", "act_ms")
+    )
     figures = [
         *(Figure(f"export_ratio.{pictures}", files[pictures], "") for pictures in ("video", "jpeg")),
         Figure("import_ratio", files["import"], ""),
@@ -64,8 +79,15 @@ def measure(seconds: float) -> Report:
         Figure("bridge_share", 100.0 * share, "%"),
         Figure("bridge_messages_per_s", viewer.count / seconds, "1/s"),
         Figure("loop_p99_ratio.bridge", lateness[1] / lateness[0], "", "<= 1.1"),
+        Figure("drive_observe_ms", float(np.median(observing)), "ms"),
+        Figure("drive_observe_ms_p99", float(np.percentile(observing, 99)), "ms"),
+        Figure("drive_act_ms", float(np.median(acting)), "ms"),
+        Figure("drive_act_ms_p99", float(np.percentile(acting, 99)), "ms"),
+        Figure("drive_delay_steps", delay, "steps"),
+        Figure("loop_p99_ratio.drive", lateness[2] / lateness[0], "", "<= 1.1"),
     ]
-    rows = [{"bridge": bridge, **control} for bridge, control in ((False, alone), (True, watched))]
+    with_what = (("nothing", alone), ("bridge", watched), ("program", driven))
+    rows = [{"with": name, **control} for name, control in with_what]
     return Report("interop", figures, rows)
 
 
@@ -85,10 +107,55 @@ def _trial(visitor: RestClient, seconds: float) -> Mapping[str, Any]:
     return control
 
 
+class _Request(NamedTuple):
+    """One turn of a program that drives: first number of the row that it sent, and times of its requests."""
+
+    step: int  # of the observation
+    number: float
+    observe_ms: float
+    act_ms: float
+
+
+def _drive(demo: RunningLab, address: str, seconds: float) -> tuple[list[_Request], Mapping[str, Any]]:
+    """Drive for `seconds` at the control rate; return the requests and control's figures."""
+    requests: list[_Request] = []
+    with Station(address, program="benchmark") as station:
+        period, _ = 1.0 / station.describe().rate, station.begin()
+        start = station.observe().joints.copy()
+        begun = time.monotonic()
+        for number in range(1, round(seconds / period)):
+            row = start.copy()
+            row[0] += 0.2 * math.sin(2.0 * number * period)
+            before = time.monotonic()
+            observation = station.observe()
+            between = time.monotonic()
+            station.act(row)
+            after = time.monotonic()
+            times = 1000.0 * (between - before), 1000.0 * (after - between)
+            requests.append(_Request(observation.step, float(row[0]), *times))
+            time.sleep(max(0.0, begun + number * period - time.monotonic()))
+        client = StationClient(demo.data / "stations" / STATION)
+        control: Mapping[str, Any] = client.status()["control"]
+        client.close()
+        station.end()
+    return requests, control
+
+
+def _delay_steps(episode: Episode, requests: Sequence[_Request]) -> float:
+    """Return the median number of steps from a row's observation to its first place in the plan before safety."""
+    steps = np.array(episode.smoothed["step"].to_pylist())
+    planned = np.array([row[0] for row in episode.smoothed["smoothed"].to_pylist()])
+    delays = []
+    for request in requests:
+        places = steps[(planned == np.float32(request.number)) & (steps > request.step)]
+        delays += [int(places[0]) - request.step] if len(places) else []
+    return float(np.median(delays))
+
+
 @contextmanager
-def _bridge(demo: RunningLab) -> Iterator[tuple[psutil.Process, str]]:
-    """Yield the process of a bridge and its address."""
-    command = [sys.executable, "-m", "runtime.clients.foxglove", STATION, "--port", "0", "--lifeline"]
+def _client(demo: RunningLab, module: str) -> Iterator[tuple[psutil.Process, str]]:
+    """Yield the process of a station's client that other programs connect to, and its address."""
+    command = [sys.executable, "-m", module, STATION, "--port", "0", "--lifeline"]
     child = subprocess.Popen(
         command, cwd=ROOT, env=demo.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

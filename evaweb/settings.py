@@ -188,6 +188,7 @@ EVA_ARCHIVE_DAYS = environment.archive_days("EVA_ARCHIVE_DAYS", EVA_STORE is not
 CONTENT_SECURITY_POLICY = headers.content_security_policy(getattr(EVA_STORE, "origin", ""))
 SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"
+DEFAULT_EXCEPTION_REPORTER_FILTER = "evaweb.core.exception_reports.SecretFilter"
 AUTHENTICATION_BACKENDS = [
     "axes.backends.AxesStandaloneBackend",
     "evaweb.serving.lockout_page.ManyNames",
@@ -246,6 +247,8 @@ EVA_GATE_NAME = os.environ.get("EVA_GATE_NAME", "")
 EVA_RESERVE_BYTES = int(1e9 * environment.gigabytes("EVA_RESERVE_GB", 5.0))
 # Size of the local cache of a bucket's objects, set in [GB].
 EVA_CACHE_BYTES = int(1e9 * environment.gigabytes("EVA_CACHE_GB", 10.0))
+# Whether people without a Hugging Face token of their own push and pull with the worker's login.
+EVA_HUB_LAB_ACCOUNT = environment.read_flag("EVA_HUB_LAB_ACCOUNT", True)
 # Unread data buffered for a page before it is disconnected, set in [MiB].
 EVA_UNREAD_BYTES = int(2**20 * environment.mebibytes("EVA_UNREAD_MIB", 8.0))
 # Longest wait of a request for a station's answer [s]; after it the outcome is unknown.

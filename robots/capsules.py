@@ -22,11 +22,15 @@ _about: dict[bytes, tuple[Capsule, ...]] = {}  # cache by the content of the sha
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
-    """Points within `radius` of the segment from `start` to `end`, float64 [3] in the link's frame [m]."""
+    """Points within `radius` of the segment from `start` to `end`, float64 [3] in the link's frame [m].
+
+    `finger` is True for a finger that does not move with its gripper.
+    """
 
     start: Float64
     end: Float64
     radius: float
+    finger: bool = False
 
 
 def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
@@ -120,7 +124,7 @@ def smallest_capsule(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
 
 
 def _declared(table: CapsuleTable) -> Capsule:
-    return Capsule(np.array(table.start), np.array(table.end), table.radius)
+    return Capsule(np.array(table.start), np.array(table.end), table.radius, table.finger)
 
 
 def _balls(link_shapes: Sequence[Shape]) -> tuple[Float64, Float64]:

@@ -87,7 +87,8 @@ class Clearance:
         self._ends = np.ones((len(parts), 4, 2))  # in the link, homogeneous
         for ends, (_, capsule) in zip(self._ends, parts, strict=True):
             ends[:3, 0], ends[:3, 1] = capsule.start, capsule.end
-        self._fingers = np.asarray(body.moving_mask()[self._parts][:, list(robot.gripper_dims)].any(axis=1))
+        moved = body.moving_mask()[self._parts][:, list(robot.gripper_dims)].any(axis=1)
+        self._fingers = moved | np.array([capsule.finger for _, capsule in parts], dtype=bool)
         self._select_pairs(*_candidates(robot, body, self._parts))
         self._select_pairs(*self._telling(robot))
 

@@ -95,6 +95,8 @@ class CapsuleTable(Table):
     start: Triple
     end: Triple
     radius: Positive
+    finger: bool = False
+    """Whether it is a finger that does not move with its gripper: fingers may come down to the table."""
 
 
 def _several(value: Any) -> Any:
@@ -137,6 +139,37 @@ class RosTable(Table):
     cameras: dict[Name, Topic] = {}
     """Logical camera name = topic."""
     groups: dict[Name, RosGroupTable] = {}
+
+
+class LerobotJointTable(Table):
+    """Feature of a LeRobot device that is one joint of ours; its numbers are converted linearly."""
+
+    feature: Label
+    """Name of the feature in the device's observations and actions, such as "shoulder_pan.pos"."""
+    unit: Literal["same", "degrees"] = "same"
+    """Unit of the device's numbers: that of the robot's description, or degrees for a joint in rad."""
+    theirs: Pair | None = None
+    """Two different numbers of the device, instead of `unit`."""
+    ours: Pair | None = None
+    """The numbers of ours that `theirs` are."""
+
+    @model_validator(mode="after")
+    def _two_ranges(self) -> LerobotJointTable:
+        ranges = [pair for pair in (self.theirs, self.ours) if pair is not None]
+        wide = all(first != last for first, last in ranges)
+        if len(ranges) == 1 or not wide or (ranges and self.unit != "same"):
+            raise PydanticCustomError(
+                "ranges",
+                "allowed: `unit`, or both `theirs` and `ours` with two different numbers each",
+            )
+        return self
+
+
+class LerobotTable(Table):
+    """LeRobot's names and units of the robot, for LeRobot's own driver of it."""
+
+    joints: dict[Name, dict[Label, LerobotJointTable]] = {}
+    """Group = joint of the group = feature."""
 
 
 class OverrideTable(Table):
@@ -193,6 +226,7 @@ class RobotTable(Table):
     """Pose of `mount_frame` in the scene, whose table is z = 0: for drawings and the simulated bench."""
     collision: CollisionTable = CollisionTable()
     ros: RosTable | None = None
+    lerobot: LerobotTable | None = None
     groups: Annotated[list[GroupTable], Field(min_length=1)]
     poses: dict[Name, dict[str, list[float]]]
     """Named poses, one vector per group; "home" is required."""

@@ -50,6 +50,7 @@ def inspect_robot(name: str | Path) -> Inspection:
         *(line for group in whole.groups for line in _group(whole, group, table)),
         *_poses(usual, whole),
         *_ros(table),
+        *_lerobot(table),
     ]
     return Inspection(
         tuple(lines),
@@ -179,6 +180,11 @@ def _ros(table: RobotTable) -> Iterator[str]:
     for name, group in table.ros.groups.items():
         topics = {key: getattr(group, key) for key in RosGroupTable.model_fields}
         yield f"  {name}: {', '.join(f'{key} {topic}' for key, topic in topics.items() if topic is not None)}"
+
+
+def _lerobot(table: RobotTable) -> Iterator[str]:
+    for group, joints in (table.lerobot.joints if table.lerobot else {}).items():
+        yield f"lerobot {group}: {', '.join(f'{joint} {entry.feature}' for joint, entry in joints.items())}"
 
 
 def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iterator[str]:

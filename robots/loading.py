@@ -79,6 +79,7 @@ def load_robot(
     reject_duplicates(file, "groups", [group.name for group in table.groups])
     reject_duplicates(file, "cameras", list(table.cameras.values()))
     _check_ros(file, table)
+    _check_lerobot(file, table)
     _check_collision(file, table, tree)
     chosen = apply_gripper_choices(file, _chosen(file, table, groups), grippers or {})
     starts = np.cumsum([0, *(len(entry.joints) for entry in chosen)]).tolist()
@@ -110,6 +111,7 @@ def load_robot(
         stand=pose_vector(f"{file}: stand", table.stand),
         collision=table.collision,
         ros=table.ros,
+        lerobot=table.lerobot,
     )
 
 
@@ -155,6 +157,18 @@ def _check_ros(file: Path, table: RobotTable) -> None:
         unknown = [name for name in names if name not in allowed]
         if unknown:
             raise RobotError(f"{file}: ros.{key} names {', '.join(unknown)}; allowed: {', '.join(allowed)}")
+
+
+def _check_lerobot(file: Path, table: RobotTable) -> None:
+    """Raise RobotError if [lerobot] names unknown groups or joints."""
+    joints = {group.name: group.joints for group in table.groups}
+    for group, named in (table.lerobot.joints if table.lerobot else {}).items():
+        if group not in joints:
+            raise RobotError(f"{file}: lerobot.joints names {group}; allowed: {', '.join(joints)}")
+        if unknown := [joint for joint in named if joint not in joints[group]]:
+            raise RobotError(
+                f"{file}: lerobot.joints.{group} names {', '.join(unknown)}; allowed: {', '.join(joints[group])}"
+            )
 
 
 def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robots.chain import Chain
-from robots.description import CollisionTable, RosTable
+from robots.description import CollisionTable, LerobotTable, RosTable
 from robots.errors import RobotError
 from robots.rotations import Float64, quaternion_of_matrix
 
@@ -165,6 +165,7 @@ class Robot:
     stand: Float64
     collision: CollisionTable
     ros: RosTable | None
+    lerobot: LerobotTable | None
 
     @property
     def dim(self) -> int:

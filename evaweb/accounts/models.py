@@ -1,4 +1,4 @@
-"""Profiles: what people state about themselves besides their account."""
+"""What people state about themselves, and give to the lab, besides their account."""
 
 from __future__ import annotations
 
@@ -18,3 +18,20 @@ class Profile(models.Model):
 
     def __str__(self) -> str:
         return f"profile of {self.user}"
+
+
+class HubToken(models.Model):
+    """Hugging Face token of a person, encrypted: evaweb.accounts.hub_tokens."""
+
+    user = models.OneToOneField(
+        settings.AUTH_USER_MODEL, primary_key=True, on_delete=models.CASCADE, related_name="hub_token"
+    )
+    encrypted = models.TextField()
+    ending = models.CharField("ends in", max_length=4)
+    entered_at = models.DateTimeField("entered")
+
+    class Meta:
+        verbose_name = "Hugging Face token"
+
+    def __str__(self) -> str:
+        return f"Hugging Face token of {self.user}"

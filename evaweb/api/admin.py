@@ -16,6 +16,7 @@ from django.db.models import QuerySet
 from django.http import HttpRequest
 from django.utils import timezone
 
+from evaweb.accounts.models import HubToken
 from evaweb.accounts.roles import Role, role_of, set_role
 from evaweb.api.models import Token
 
@@ -160,6 +161,30 @@ class TokenAdmin(admin.ModelAdmin):
                 token.user.get_username(),
                 request.user.get_username(),
             )
+        return super().log_deletions(request, queryset)
+
+
+@admin.register(HubToken)
+class HubTokenAdmin(admin.ModelAdmin):
+    """Administration of people's Hugging Face tokens: entered by themselves, here only removed."""
+
+    list_display = ("user", "ending", "entered_at")
+    search_fields = ("user__username",)
+    fields = ("user", "ending", "entered_at")
+
+    def has_add_permission(self, request: HttpRequest) -> bool:
+        """Return False: only people themselves enter their token."""
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: HubToken | None = None) -> bool:
+        """Return False: only people themselves replace their token."""
+        return False
+
+    def log_deletions(self, request: HttpRequest, queryset: QuerySet[HubToken]) -> Any:
+        """Log deletions in the log of logins too."""
+        for token in queryset:
+            name, by = token.user.get_username(), request.user.get_username()
+            log.info("the Hugging Face token of %a is removed by %a", name, by)
         return super().log_deletions(request, queryset)
 
 

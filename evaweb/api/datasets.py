@@ -113,7 +113,8 @@ def episodes(
 def ask(request: HttpRequest, given: dataset_orders.Order) -> Any:
     """Queue a check, repair, conversion, import, merge, split or export as MCAP.
 
-    Only administrators may delete, push and pull. The job reports the progress. MCAP files are then downloaded
+    Only administrators may delete, push and pull. Push and pull use the Hugging Face token that the user has stored
+    under Your account, else the lab's account. The job reports the progress. MCAP files are then downloaded
     episode by episode, for a day.
     """
     return Status(202, dataset_orders.submit_order(user=request.auth, given=given.model_dump()))

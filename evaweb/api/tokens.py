@@ -20,6 +20,7 @@ from evaweb.accounts.credentials import (
     credentials,
     digest,
 )
+from evaweb.accounts.hub_tokens import remove_hub_token
 from evaweb.api.models import Token
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.core.lock_wait import lock_wait
@@ -109,7 +110,10 @@ credentials.register_kind(EXPIRED_ALLOWED[TOKEN], lambda secret: user_of_token(s
 def _ended(
     sender: Any, instance: User, raw: bool, update_fields: Iterable[str] | None = None, **named: Any
 ) -> None:
-    """Delete the tokens of an account whose password changes, or that is deactivated."""
+    """Delete the tokens of an account whose password changes, or that is deactivated.
+
+    Its Hugging Face token is deleted only in the second case.
+    """
     fields = {"password", "is_active"} if update_fields is None else set(update_fields)
     if raw or instance.pk is None or not fields & {"password", "is_active"}:
         return
@@ -123,6 +127,7 @@ def _ended(
     if before["is_active"] and not instance.is_active:
         log.info("%a is switched off", name)
         revoke_tokens(user=instance, why="the account is switched off")
+        remove_hub_token(user=instance)
 
 
 def _hashed_anew(user: User, fields: set[str]) -> bool:

@@ -8,14 +8,14 @@ from typing import Any
 from django.conf import settings
 from django.core.checks import CheckMessage, Error, Tags, Warning, register
 
-from evaweb.core.environment import database_files, readable_by_others
+from evaweb.core.environment import HUB_KEY, database_files, readable_by_others
 
 RESTORING = ".restoring"  # folder in DATA with files that a restore has copied but not moved into place yet
 
 
 @register(Tags.security)
 def check_private_files(**options: Any) -> list[CheckMessage]:
-    """Return a warning for each of data folder, database and secret key that other accounts can read."""
+    """Return a warning for each of data folder, database and keys that other accounts can read."""
     return [
         Warning(
             f"{path} can be read by others: {path.stat().st_mode & 0o777:o}",
@@ -60,4 +60,5 @@ def _private() -> list[Path]:
     data = Path(settings.DATA_DIR)
     database = settings.DATABASES["default"]
     sqlite = database["ENGINE"].endswith("sqlite3")
-    return [data, data / "secret_key", *(database_files(Path(database["NAME"])) if sqlite else [])]
+    keys = [data / "secret_key", data / HUB_KEY]
+    return [data, *keys, *(database_files(Path(database["NAME"])) if sqlite else [])]

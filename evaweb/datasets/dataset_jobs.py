@@ -107,7 +107,7 @@ def _sentence(action: str, result: Mapping[str, Any]) -> str:
     if action in ("check", "repair"):
         return "whole" if not problems else f"{_counted(len(problems), 'problem')}: {problems[0]}"
     if action == "push":
-        return str(result.get("address", ""))
+        return str(result.get("address", "")) + _account_of(result)
     if action == "import":
         text = f"{_counted(result['episodes'], 'episode')} can be reviewed, {result['made']} new"
         return text + (f"; {problems[0]}" if problems else "")
@@ -129,7 +129,15 @@ def _sentence(action: str, result: Mapping[str, Any]) -> str:
     left = [thing for part in parts for thing in part.get("left_out", ())]
     text += f"; {_counted(encoded, 'video')} coded again" if encoded else ""
     text += f"; left out: {'; '.join(left)}" if left else ""
+    text += _account_of(result) if action == "pull" else ""
     return text + (f"; {problems[0]}" if problems else "")
+
+
+def _account_of(result: Mapping[str, Any]) -> str:
+    """Return whose account on the hub was used; "" for a job of an earlier version."""
+    if "account" not in result:
+        return ""
+    return f", with the token of {result['account']}" if result["account"] else ", with the lab's account"
 
 
 def _counted(count: int, thing: str) -> str:

@@ -10,11 +10,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
 
 import robots
+from evaweb.accounts.hub_tokens import choose_hub_account
 from evaweb.accounts.roles import Role, require_role
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.datasets.bags import find_bag, read_mapping_text, require_robot
 from evaweb.datasets.overview import dataset_names, folder_named, get_dataset_folder
 from evaweb.episodes.subsets import subset_datasets, subset_get
+from evaweb.jobs.kinds import ORDERED_BY
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.core.sentences import Pattern
@@ -120,7 +122,10 @@ class Delete(_Order):
 
 
 class Push(_Order):
-    """Order to upload a dataset to the Hugging Face hub. Requires an administrator."""
+    """Order to upload a dataset to the Hugging Face hub. Requires an administrator.
+
+    It uses the Hugging Face token that the user has stored under Your account, else the lab's account.
+    """
 
     what: Literal["push"]
     dataset: Name
@@ -130,7 +135,10 @@ class Push(_Order):
 
 
 class Pull(_Order):
-    """Order to download a dataset from the Hugging Face hub as a new one. Requires an administrator."""
+    """Order to download a dataset from the Hugging Face hub as a new one. Requires an administrator.
+
+    It uses the Hugging Face token that the user has stored under Your account, else the lab's account.
+    """
 
     what: Literal["pull"]
     repository: Name
@@ -241,6 +249,8 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
         args |= _subset_args(order)
     if isinstance(order, Delete):
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
+    if isinstance(order, Push | Pull):
+        args |= {ORDERED_BY: user.pk, "account": choose_hub_account(user).value}
     if isinstance(order, Import) and order.robot and not robots.is_described(order.robot):
         raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
     _require_no_deletion(names)

@@ -9,6 +9,7 @@ from typing import Any
 from django.conf import settings
 from django.db.models.functions import Now
 
+from evaweb.accounts.hub_tokens import load_hub_token
 from evaweb.core.errors import EvaError
 from evaweb.datasets.bags import bags_dir, check_mapping, find_bag
 from evaweb.datasets.dataset_orders import KIND, least_for
@@ -19,11 +20,17 @@ from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.exports import MCAP, write_mcap
 from evaweb.episodes.models import Subset
 from evaweb.episodes.subsets import subset_get, subset_uuids
-from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
+from evaweb.jobs.kinds import ORDERED_BY, Cancelled, JobContext, job_kind
+from runtime.core.sentences import fixed
 from runtime.datasets import layout
 from runtime.recording.files import RecordingError
 
 Found = dict[str, Any]
+_NO_LOGIN = fixed(
+    "datasets.job_kinds.no_login",
+    "the worker has no login at the Hugging Face hub: enter your own token under Your account, and order it again, or "
+    "start the lab with HF_TOKEN",
+)
 _READ = ("check", "push", "mcap", "propose")  # orders that change no dataset
 
 
@@ -137,32 +144,38 @@ def _delete(work: JobContext) -> Found:
 
 
 def _push(work: JobContext) -> Found:
-    from runtime.datasets.hub import push
+    from runtime.datasets.hub import has_login, push
 
     args = work.args
+    token, name = load_hub_token(person=args.get(ORDERED_BY), account=args.get("account", ""))
+    if token is None and not has_login():
+        raise EvaError(_NO_LOGIN)
     address = push(
         _source(work),
         args["repository"],
         private=args["private"],
         licence=args.get("licence", ""),
+        token=token,
         tell=work.report_progress,
     )
-    return {"address": address}
+    return {"address": address, "account": name}
 
 
 def _pull(work: JobContext) -> Found:
     from runtime.datasets.hub import pull
 
     args = work.args
+    token, name = load_hub_token(person=args.get(ORDERED_BY), account=args.get("account", ""))
     pulled = pull(
         args["repository"],
         folder_named(args["to"]),
         revision=args["revision"],
         reserve=settings.EVA_RESERVE_BYTES,
+        token=token,
         tell=work.report_progress,
     )
     rows = sum(listed.length for listed in pulled.episodes)
-    return {"dataset": args["to"], "episodes": len(pulled.episodes), "frames": rows}
+    return {"dataset": args["to"], "episodes": len(pulled.episodes), "frames": rows, "account": name}
 
 
 def _mcap(work: JobContext) -> Found:

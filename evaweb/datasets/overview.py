@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from evaweb.core.environment import HUB_KEY
 from evaweb.core.errors import EvaError, NotFound
 from evaweb.core.printed_names import is_name
 from evaweb.episodes.folders import data_dir
@@ -30,13 +31,13 @@ _THERE_NO_DATASET_THERE = Pattern(
 
 _LONGEST_PART = 255  # limit of file systems [bytes]
 DEPTH = 3  # levels below the data folder that are searched for datasets
-# Folders of the lab itself, which contain no datasets.
+# Folders and files of the lab itself, which contain no datasets.
 _OWN = frozenset(
     (
         *("episodes", "previews", "arrivals", "archived", "cache", "uploads", "reveals", "exports", "labels"),
         *("mcap", "quality", "quarantine", "reviews", "scores", "sessions"),
         *("stations", "jobs", "broker", "unwritten", "pictures", "logs", "static", "media"),
-        *("deployments", "diagnosis", "link", "bags", "farm", "environments", "crates"),
+        *("deployments", "diagnosis", "link", "bags", "farm", "environments", "crates", HUB_KEY),
     )
 )
 

@@ -15,6 +15,7 @@ from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
+from evaweb.accounts.hub_tokens import describe_hub_login
 from evaweb.accounts.roles import Role, role_of
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.core.printed_names import is_name
@@ -209,6 +210,7 @@ def work_context(name: str) -> dict[str, Any]:
 
 
 def rights_context(request: HttpRequest) -> dict[str, Any]:
-    """Return which orders the user may submit."""
+    """Return which orders the user may submit, and, if they may push and pull, with whose account on the hub."""
     role = role_of(request.user)
-    return {"may_ask": role is not Role.VIEWER, "may_delete": role is Role.ADMIN}
+    hub = describe_hub_login(request.user) if role is Role.ADMIN else None
+    return {"may_ask": role is not Role.VIEWER, "may_delete": role is Role.ADMIN, "hub": hub}

@@ -38,7 +38,7 @@ _PAGES = (
     Page("Wall", "lab-wall", "big screen spectator"),
     Page("Failures", "result-failures", "gallery clips causes"),
     Page("Jobs", "jobs", "worker queue progress preview publish"),
-    Page("Your account", "account", "orcid profile role"),
+    Page("Your account", "account", "orcid profile role hugging face token hub"),
     Page("Change your password", "password", "account settings"),
     Page("First steps", "first-steps", "set up begin start help", least=Role.ADMIN),
     Page("Check of the machine", "machine-check", "real time disk clock memory ports", least=Role.ADMIN),

@@ -7,7 +7,7 @@ from django.db.models import QuerySet
 from django.http import HttpRequest
 
 from evaweb.jobs import services
-from evaweb.jobs.kinds import starts_elsewhere
+from evaweb.jobs.kinds import ORDERED_BY, starts_elsewhere
 from evaweb.jobs.models import Job, JobStatus
 
 
@@ -32,7 +32,11 @@ class JobAdmin(admin.ModelAdmin):
 
     @admin.action(description="Try failed jobs again", permissions=("view",))
     def try_again(self, request: HttpRequest, jobs: QuerySet) -> None:
-        failed = [job for job in jobs.filter(status=JobStatus.FAILED) if not starts_elsewhere(job.kind)]
+        failed = [
+            job
+            for job in jobs.filter(status=JobStatus.FAILED)
+            if not starts_elsewhere(job.kind) and job.args.get(ORDERED_BY, request.user.pk) == request.user.pk
+        ]
         for job in failed:
             services.retry_job(user=request.user, job=job)
         self.message_user(request, f"{len(failed)} asked for anew", messages.SUCCESS)

@@ -11,6 +11,9 @@ from evaweb.accounts.roles import Role
 from evaweb.core.errors import EvaError
 
 Args = Mapping[str, Any]
+ORDERED_BY = (
+    "ordered_by"  # argument of jobs that use something of the person who ordered them: their primary key
+)
 
 
 class Queue(StrEnum):

@@ -23,11 +23,12 @@ from django.db.models import F, QuerySet
 from django.db.models.functions import Now
 
 from evaweb.accounts.roles import Role, require_role
-from evaweb.core.errors import Conflict
+from evaweb.core.errors import Conflict, NotAllowed
 from evaweb.core.lock_wait import retry_while_locked
 from evaweb.jobs import doorbell
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
 from evaweb.jobs.kinds import (
+    ORDERED_BY,
     Args,
     Cancelled,
     JobContext,
@@ -51,6 +52,10 @@ _JOB_ONLY_ONE_FAILED_TRIED = Pattern(
 _STARTED_ELSEWHERE = Pattern(
     "jobs.services.started_elsewhere",
     "job {job} ({key}) is not tried again as it was: start it anew {elsewhere}",
+)
+_OF_ANOTHER = Pattern(
+    "jobs.services.of_another",
+    "job {job} ({key}) uses an account of the person who ordered it: order it yourself, or let them try it again",
 )
 _JOB_THERE_NOTHING_CANCEL = Pattern(
     "jobs.services.job_there_nothing_cancel",
@@ -102,6 +107,8 @@ def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
 def retry_job(*, user: Any, job: Job) -> Job:
     """Queue a failed job again. Raises: Conflict unless it has failed; NotAllowed if the user may not request it."""
     require_role(user, least_role(job.kind, job.args))
+    if job.args.get(ORDERED_BY, user.pk) != user.pk:
+        raise NotAllowed(_OF_ANOTHER(job=job.pk, key=job.key))
     if elsewhere := declared(job.kind).start:
         raise Conflict(_STARTED_ELSEWHERE(job=job.pk, key=job.key, elsewhere=elsewhere))
     if job.status != JobStatus.FAILED:

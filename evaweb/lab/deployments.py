@@ -54,6 +54,7 @@ _ASK_S = 1.0  # timeout for a station that is to be removed
 BY_HAND = {
     ("transport", "simulated"): "a simulated station is made with a choice of its own",
     ("transport", "python"): "another program is written into the file by hand",
+    ("cameras", "python"): "another program is written into the file by hand",
 }
 
 

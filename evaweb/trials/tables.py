@@ -209,7 +209,8 @@ def _table(config: type[pydantic.BaseModel], path: tuple[str | int, ...]) -> typ
 @cache
 def _kinds() -> dict[str, type[pydantic.BaseModel]]:
     kinds = {config.model_fields["kind"].default: config for config in policy_tables()}
-    return {kind: config for kind, config in kinds.items() if kind != "none"}  # a checkpoint needs a policy
+    # A checkpoint needs a policy, and one that is there without a program that drives by hand.
+    return {kind: config for kind, config in kinds.items() if kind not in ("none", "external")}
 
 
 @cache

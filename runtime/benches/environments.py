@@ -8,7 +8,6 @@ it: `python -m runtime.benches.environments metaworld experts.py --port 0`.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
 import os
 import shutil
@@ -20,10 +19,9 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
-import runtime
 from robots.broken_pipe import exit_on_broken_pipe
 from runtime.benches.schema import bench_folder, load_schema
-from runtime.core.environment import without_web_secrets
+from runtime.core.environment import foreign_python_environment, without_web_secrets
 from runtime.core.errors import RuntimeFault, SetupError
 
 FOLDER = "environments"  # below the data folder
@@ -112,27 +110,12 @@ def make_environment(bench: str) -> Path:
 def program_variables(bench: str) -> dict[str, str]:
     """Return the environment variables for programs of the bench.
 
-    They see the package runtime, and no other package of this environment, whose versions may conflict with theirs.
-
     Raises:
-        UnusableEnvironment: If the folder for that in the temporary folder belongs to somebody else.
+        SetupError: If the folder for that in the temporary folder belongs to somebody else.
     """
-    program, package = load_schema(bench).program, Path(runtime.__file__).resolve().parent
+    program = load_schema(bench).program
     assert program is not None, bench
-    name = hashlib.sha256(str(package).encode()).hexdigest()[:12]
-    folder = Path(tempfile.gettempdir()) / f"eva-programs-{os.getuid()}" / name
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    for part in (folder.parent, folder):
-        if part.is_symlink() or part.stat().st_uid != os.getuid():
-            raise UnusableEnvironment(
-                f"{part} belongs to somebody else; allowed: remove it, or set TMPDIR to another folder"
-            )
-    with contextlib.suppress(FileExistsError):
-        (folder / "runtime").symlink_to(package)
-    own = {"PYTHONPATH": str(folder), "PYTHONNOUSERSITE": "1", **program.variables}
-    given = without_web_secrets(os.environ)
-    given.pop("PYTHONHOME", None)  # of another Python
-    return given | own
+    return foreign_python_environment() | program.variables
 
 
 def _run(command: Sequence[str]) -> None:

@@ -56,6 +56,12 @@ def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> 
             f"cameras.{key}: kind {kind!r} runs in real time, and lockstep has a clock of its own; allowed "
             "there: 'file'"
         )
+    if kind == "lerobot":
+        from runtime.cameras.lerobot import Config as LerobotConfig
+        from runtime.cameras.lerobot_camera import LerobotCamera
+
+        assert isinstance(settings, LerobotConfig)
+        return LerobotCamera(key, settings, clock)
     return LiveCamera(key, kind, settings, _address(key, settings), clock)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from typing import Protocol
 
 from runtime.cameras.base import (
     Address,
@@ -16,7 +17,7 @@ from runtime.cameras.base import (
     CapturedImage,
 )
 from runtime.cameras.image_transform import ImageTransform
-from runtime.cameras.video_stream import VideoStream
+from runtime.cameras.video_stream import DecodedFrame, VideoStream
 from runtime.core import realtime
 from runtime.core.backoff import BackOff
 from runtime.core.clock import Clock, ClockMap
@@ -62,6 +63,16 @@ SETTLE_S = (
 )
 _GRACE_S = 1.0  # beyond its own deadline; then the thread is stuck in a driver [s]
 _JOIN_S = 0.3
+
+
+class Stream(Protocol):
+    """Open connection to a camera."""
+
+    def read(self) -> DecodedFrame | None:
+        """Return the next frame, None if the camera closed the connection. Raises CameraError."""
+
+    def close(self) -> None:
+        """Release the connection."""
 
 
 class LiveCamera(Camera):
@@ -134,7 +145,7 @@ class LiveCamera(Camera):
 
     def _read_until_lost(self) -> None:
         """Open the camera and read it until it is lost, which raises CameraError."""
-        feed = VideoStream(self._address, self._settings.open_s, self._settings.read_s)
+        feed = self._open_stream()
         try:
             self._time.reset()
             settled: float | None = None
@@ -144,12 +155,19 @@ class LiveCamera(Camera):
                     raise CameraError("it closed the connection")
                 arrived = self._clock.now()
                 settled = arrived + SETTLE_S if settled is None else settled
-                captured = self._time.to_monotonic(frame.stamp, arrived)
+                captured = self._captured(frame, arrived)
                 picture = self._shape(frame.picture)
                 if arrived >= settled:
                     self._store(CapturedImage(picture, captured, arrived))
         finally:
             feed.close()
+
+    def _open_stream(self) -> Stream:
+        return VideoStream(self._address, self._settings.open_s, self._settings.read_s)
+
+    def _captured(self, frame: DecodedFrame, arrived: float) -> float:
+        """Return the frame's capture time on our clock [s]."""
+        return self._time.to_monotonic(frame.stamp, arrived)
 
     def _store(self, shot: CapturedImage) -> None:
         self._back_off.reset()

@@ -5,11 +5,16 @@ Secrets of the web are removed. Secrets of the station itself are read from vari
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
 import sys
+import tempfile
 from collections.abc import Mapping
+from pathlib import Path
 
-from runtime.core.errors import ConfigurationError
+import runtime
+from runtime.core.errors import ConfigurationError, SetupError
 
 # Session key, access to database, broker and object store, hub login: no station uses them.
 WEB_ONLY = frozenset(
@@ -48,6 +53,30 @@ def program_environment(given: Mapping[str, str]) -> dict[str, str]:
     """
     blas = {} if any(name in given for name in _BLAS_THREADS) else {_BLAS_THREADS[0]: "1"}
     return {"PYDANTIC_DISABLE_PLUGINS": "__all__", **blas, **given}
+
+
+def foreign_python_environment() -> dict[str, str]:
+    """Return the environment for programs that run in another Python environment than this one.
+
+    They see the package runtime, and no other package of this environment, whose versions may conflict with theirs.
+
+    Raises:
+        SetupError: The folder for that in the temporary folder belongs to somebody else.
+    """
+    package = Path(runtime.__file__).resolve().parent
+    name = hashlib.sha256(str(package).encode()).hexdigest()[:12]
+    folder = Path(tempfile.gettempdir()) / f"eva-programs-{os.getuid()}" / name
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for part in (folder.parent, folder):
+        if part.is_symlink() or part.stat().st_uid != os.getuid():
+            raise SetupError(
+                f"{part} belongs to somebody else; allowed: remove it, or set TMPDIR to another folder"
+            )
+    with contextlib.suppress(FileExistsError):
+        (folder / "runtime").symlink_to(package)
+    given = without_web_secrets(os.environ)
+    given.pop("PYTHONHOME", None)  # of another Python
+    return given | {"PYTHONPATH": str(folder), "PYTHONNOUSERSITE": "1"}
 
 
 def ssh_environment() -> dict[str, str]:

@@ -13,10 +13,11 @@ import robots
 from robots import Robot
 from runtime.core.errors import RecordingError
 from runtime.core.settings import Settings, explain_validation_error
-from runtime.interop.bag_messages import NUMBERS, PICTURES
+from runtime.interop.bag_messages import NUMBERS, PICTURES, TEXT
 from runtime.interop.bag_reader import Bag
 
 # In names of topics, by preference.
+_TASKS = ("instruction", "task", "prompt")
 _OF_ACTIONS = ("command", "cmd", "action", "leader", "target", "desired", "trajectory", "executed")
 
 
@@ -117,7 +118,7 @@ def propose_mapping(bag: Bag, robot: Robot) -> tuple[BagMapping, list[str]]:
     """Return a mapping for the topics of a bag, and a sentence for each thing that no topic was found for.
 
     Joints are found by their names in the messages, with or without the name of their group. Topics of commands are
-    those with a word such as "command" in their names.
+    those with a word such as "command" in their names, the task's is a text named after it.
 
     Raises: RecordingError if no topic has measured joints.
     """
@@ -157,8 +158,17 @@ def propose_mapping(bag: Bag, robot: Robot) -> tuple[BagMapping, list[str]]:
             missing.append(
                 f"cameras: no topic is named after {camera.key}; pictures: {', '.join(pictures) or 'none'}"
             )
-    state, action = sources["state"], sources["action"]
-    return BagMapping(robot=robot.name, state=state, action=action, cameras=cameras), missing
+    texts = [topic for topic, kind in bag.kinds.items() if kind == TEXT]
+    tasks = [topic for topic in texts if any(word in topic.lower() for word in _TASKS)]
+    if not tasks:
+        missing.append(f"task: no text topic is named after it; texts: {', '.join(texts) or 'none'}")
+    return BagMapping(
+        robot=robot.name,
+        task_topic=tasks[0] if tasks else "",
+        state=sources["state"],
+        action=sources["action"],
+        cameras=cameras,
+    ), missing
 
 
 def _is_of_actions(topic: str) -> bool:

@@ -2,6 +2,7 @@
 
 # Module of each kind. It is imported only if a deployment names it.
 KINDS = {
+    "external": "runtime.policies.external",
     "gr00t": "runtime.policies.gr00t",
     "lerobot": "runtime.policies.lerobot",
     "mock": "runtime.policies.mock",

@@ -20,12 +20,12 @@ from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
+from runtime.core.node_sockets import address, bound
 from runtime.core.types import Float64
 from runtime.simulation import program
 from runtime.simulation.node import positive, run, start_pose
 from runtime.simulation.scripts.pick_place import PickPlace, Skill
 from runtime.simulation.scripts.script import Script, WavingScript
-from runtime.simulation.sockets import address, bound
 from runtime.teleoperators.base import Leader
 from runtime.transports import zmq as node
 from runtime.transports.node_source import NodeSource

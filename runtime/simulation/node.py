@@ -23,6 +23,7 @@ from runtime.benches.schema import installed_benches
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault, SetupError
+from runtime.core.node_sockets import Sockets
 from runtime.core.types import Float64, UInt8
 from runtime.simulation import environments, program
 from runtime.simulation.bench.bench import BenchError
@@ -31,7 +32,6 @@ from runtime.simulation.bench.plant import Plant, poses
 from runtime.simulation.command_gate import AcceptedCommand, CommandGate
 from runtime.simulation.drives import Drives
 from runtime.simulation.scripts.gestures import Gesture
-from runtime.simulation.sockets import Sockets
 
 if TYPE_CHECKING:
     from threading import Event

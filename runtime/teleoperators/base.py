@@ -47,6 +47,11 @@ class Leader(ABC):
     def name(self) -> str:
         """Kind and address of the leader, for messages."""
 
+    @property
+    def start_s(self) -> float:
+        """Time from `connect` beyond which a leader without a first pose counts as absent [s]."""
+        return 5.0
+
     @abstractmethod
     def connect(self) -> None:
         """Start to listen; a leader that starts later is connected then. Raises RuntimeFault."""

@@ -36,7 +36,6 @@ _NODE_DRIVES = fixed(
 )
 
 FollowMode = Literal["absolute", "relative"]
-_FOUND_S = 5.0  # time for the leader's first message at set-up [s]
 _LOOK_S = 0.02  # polling period [s]
 _SPARE_ROWS = 2  # rows beyond the age limit: silence is reported by its age, not by starvation
 
@@ -79,9 +78,9 @@ class LeaderPolicy(Policy):
     def connect(self) -> PolicyInfo:
         """Start to listen and wait for the leader's first pose. Raises PolicyLostError if none arrives in time."""
         self.leader.connect()
-        deadline = self._clock.now() + _FOUND_S
+        begun = self._clock.now()
         while self.leader.latest_pose is None:
-            if self._clock.now() > deadline:
+            if self._clock.now() - begun > self.leader.start_s:
                 raise PolicyLostError(self.leader_problem() or _SAYS_NOTHING(who=self.leader.name))
             self._clock.sleep_until(self._clock.now() + _LOOK_S)
         return PolicyInfo(self.leader.name, action_space="joint")

@@ -18,11 +18,11 @@ from pydantic import model_validator
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
+from runtime.core.node_sockets import is_loopback
 from runtime.core.settings import Settings
 from runtime.teleoperators.base import Leader, joints_from_state
 from runtime.transports import node_link
 from runtime.transports.node_link import Endpoint
-from runtime.transports.zmq import is_loopback
 
 if TYPE_CHECKING:
     from robots import Robot

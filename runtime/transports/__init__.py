@@ -3,6 +3,7 @@
 # Module of each kind. It is imported only if a deployment names it.
 KINDS = {
     "dataset": "runtime.transports.dataset",
+    "lerobot": "runtime.transports.lerobot",
     "ros1": "runtime.transports.ros1",
     "ros2": "runtime.transports.ros2",
     "zmq": "runtime.transports.zmq",

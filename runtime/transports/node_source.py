@@ -203,7 +203,8 @@ class NodeSource(Source):
         with self._changed:
             silent = now - self._usable_at
             refused = self._refused if self._heard_at > self._usable_at else None
-            reason = "" if silent <= self._stalled_after else refused[0] if refused else "silent"
+            stalled = silent > self._stalled_after
+            reason = "" if not stalled else refused[0] if refused else self._silence_reason()
             fresh = reason not in ("", self._told)
             self._told = reason
         if not fresh:
@@ -234,6 +235,10 @@ class NodeSource(Source):
         self._usable_at = self._heard_at = self._clock.now()
         self._refused: tuple[str, str] | None = None  # fault and text of the newest refused message
         self._told = ""
+
+    def _silence_reason(self) -> str:
+        """Return why no message arrives; each reason is one event."""
+        return "silent"
 
     def _no_frame_reason(self, silent: float, refusal: str | None) -> str:
         fields = {"endpoint": self._endpoint, "seconds": silent}

@@ -5,14 +5,13 @@ The protocol has no handshake, authentication or encryption, so endpoints beyond
 
 from __future__ import annotations
 
-import contextlib
-import ipaddress
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import model_validator
 
 from runtime.core.clock import Clock
 from runtime.core.errors import ConfigurationError
+from runtime.core.node_sockets import is_loopback
 from runtime.transports.base import Capabilities
 from runtime.transports.node_link import Endpoint, NodeSettings
 from runtime.transports.node_sink import NodeSink
@@ -47,19 +46,6 @@ class Config(NodeSettings):
                     "allowed: a loopback address, or insecure_link = true on a network you trust"
                 )
         return self
-
-
-def is_loopback(endpoint: str) -> bool:
-    """Return True if the endpoint cannot be reached from another machine."""
-    scheme, _, address = endpoint.partition("://")
-    if scheme in {"ipc", "inproc"}:
-        return True
-    host = address.rpartition(":")[0].strip("[]")
-    if host == "localhost":
-        return True
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return False
 
 
 def _has_port(endpoint: str) -> bool:

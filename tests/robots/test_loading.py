@@ -148,6 +148,16 @@ def test_a_robot_travels_between_processes() -> None:
         ),
         (
             "[collision]",
+            '[lerobot.joints.head]\npan = { feature = "pan.pos" }\n[collision]',
+            "lerobot.joints names head; allowed: left_arm, right_arm",
+        ),
+        (
+            "[collision]",
+            '[lerobot.joints.left_arm]\npan = { feature = "pan.pos" }\n[collision]',
+            "lerobot.joints.left_arm names pan; allowed: joint0, joint1,",
+        ),
+        (
+            "[collision]",
             '[collision]\nwithout = ["cover"]',
             "collision.without names cover; allowed: base_link,",
         ),

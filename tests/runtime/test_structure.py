@@ -17,7 +17,7 @@ def test_nothing_in_the_runtime_names_a_robot():
     names = {name for robot in robots for name in (robot, robot.replace("_", "-"), robot.replace("_", " "))}
     pattern = re.compile("|".join(map(re.escape, sorted(names))), re.IGNORECASE)
     files = sorted((ROOT / "runtime").rglob("*.py"))
-    assert len(robots) == 6
+    assert len(robots) == 7
     assert len(files) > 400
     assert {
         str(path.relative_to(ROOT)): found

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from evaweb.core.environment import HUB_KEY
 from evaweb.lab.backups.errors import BackupError
 
 SEALS = ("outcome.json", "sealed.json")
@@ -20,6 +21,7 @@ _LEFT_OUT = {  # entries of the data folder that are recreated at the next start
     "cache",
     "diagnosis",
     "environments",
+    HUB_KEY,  # so that no backup suffices to read the tokens in its database
     "jobs",
     "lab.lock",
     "logs",
@@ -33,6 +35,7 @@ _LEFT_OUT_ANYWHERE = {
     "endpoints",
     "foxglove.token",
     "panel.pin",
+    "robot_server.token",
 }  # of a station: recreated, see docs/administrator.md
 _TRIES = 3
 _BLOCK = 1 << 20

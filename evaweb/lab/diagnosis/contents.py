@@ -53,7 +53,16 @@ _SHOWN = (
         "EVA_COMMAND_TIMEOUT_S",
         "EVA_JOB_STALE_S",
     ),
-    *("EVA_WORKER_GRACE_S", "EVA_WORKER_NICE", "EVA_COPIES", "EVA_DEBUG", "TZ", "LANG", "XDG_RUNTIME_DIR"),
+    *(
+        "EVA_WORKER_GRACE_S",
+        "EVA_WORKER_NICE",
+        "EVA_COPIES",
+        "EVA_DEBUG",
+        "EVA_HUB_LAB_ACCOUNT",
+        "TZ",
+        "LANG",
+        "XDG_RUNTIME_DIR",
+    ),
 )
 
 

@@ -10,14 +10,11 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import secrets
 import signal
-import ssl
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +23,9 @@ import zmq
 from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.foxglove.server import FoxgloveServer
 from runtime.clients.foxglove.topics import StationTopics
+from runtime.clients.listener import add_listener_arguments, get_or_create_token, make_ssl_context
 from runtime.clients.panel.watch import StreamReader
 from runtime.core import logs
-from runtime.core.durable_files import write_durably
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.bus import Endpoints
 from runtime.ipc.lifeline import Lifeline
@@ -36,7 +33,7 @@ from runtime.ipc.lifeline import Lifeline
 log = logging.getLogger(__name__)
 _TURN_S, _FIND_S = 0.02, 0.5
 _NICENESS = 10  # whoever only looks comes after everything that moves
-_TOKEN_FILE = "foxglove.token"
+TOKEN_FILE = "foxglove.token"
 _COORDINATOR = ("state", "joints", "event")
 
 
@@ -90,15 +87,6 @@ class Bridge:
             reader.turn_to("")
 
 
-def token_of(station_dir: Path) -> str:
-    """Return the token of the station's bridge, which is made once, in a file that only this account can read."""
-    file = station_dir / _TOKEN_FILE
-    if not file.exists():
-        station_dir.mkdir(parents=True, exist_ok=True)
-        write_durably(file, f"{secrets.token_urlsafe(24)}\n".encode(), mode=0o600)
-    return file.read_text("ascii").strip()
-
-
 def serve(
     station_dir: Path,
     options: argparse.Namespace,
@@ -111,9 +99,9 @@ def serve(
         ConfigurationError: The host needs a certificate, or cannot be listened at.
     """
     context: zmq.Context[Any] = zmq.Context.instance()
-    token = token_of(station_dir)
+    token = get_or_create_token(station_dir, TOKEN_FILE)
     server = FoxgloveServer(station_dir.name, token, options.origin)
-    secure = _ssl_context(options)
+    secure = make_ssl_context(options)
     try:
         port = server.open(options.host, options.port, secure)
     except OSError as error:
@@ -128,52 +116,17 @@ def serve(
         server.close()
 
 
-def _ssl_context(options: argparse.Namespace) -> ssl.SSLContext | None:
-    """Return the context of the certificate, None on loopback without one.
-
-    Raises:
-        ConfigurationError: Without a certificate beyond this machine, or one that cannot be used.
-    """
-    try:
-        loopback = ip_address(options.host).is_loopback
-    except ValueError:
-        raise ConfigurationError(
-            f"--host {options.host!r:.100}: must be an address in numbers, as 127.0.0.1"
-        ) from None
-    if options.certificate is None:
-        if not loopback:
-            raise ConfigurationError(
-                f"--host {options.host}: beyond this machine it needs --certificate and --key; allowed without: "
-                "127.0.0.1"
-            )
-        return None
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    try:
-        context.load_cert_chain(options.certificate, options.key)
-    except (OSError, ssl.SSLError) as error:
-        raise ConfigurationError(f"--certificate {options.certificate}: {error}") from None
-    return context
-
-
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until a signal or the end of the lifeline; return 2 if it cannot."""
     parser = argparse.ArgumentParser(prog="python -m runtime.clients.foxglove", description=__doc__)
-    parser.add_argument("station", help="name of a station of this computer")
-    parser.add_argument("--data-dir", type=Path, metavar="DIR", help="$EVA_DATA_DIR or ./data if not given")
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen at; beyond this machine it needs a certificate"
-    )
-    parser.add_argument("--port", type=int, default=8765, help="0 takes a free one")
-    parser.add_argument("--certificate", type=Path, help="certificate with its chain, as PEM")
-    parser.add_argument("--key", type=Path, help="its private key, as PEM")
+    add_listener_arguments(parser, port=8765)
     parser.add_argument(
         "--origin",
         action="append",
         default=[],
         help="address of a web page that may connect, as a browser sends it",
     )
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
     options = parser.parse_args(arguments)
     data = Path(options.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
     logs.configure_logging("foxglove")

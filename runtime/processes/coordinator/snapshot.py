@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, get_args
 
+from robots import Robot
 from robots.units import units_of
 from runtime.benches.appearance import describe_appearance
 from runtime.benches.schema import load_schema
@@ -13,6 +14,7 @@ from runtime.core.sentences import within
 from runtime.ipc.messages import PolicyMode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
+from runtime.lerobot.features import JointFeature
 from runtime.processes.coordinator.components import Components
 from runtime.processes.coordinator.inbox import Inbox
 from runtime.station.spec import StationSpec
@@ -103,10 +105,27 @@ def station_facts(spec: StationSpec) -> dict[str, Any]:
         "preview_rate": bus.preview_rate,
         "recorded": spec.deployment.recording.enabled,
         "lease_ttl_s": spec.deployment.lease.ttl_s,
+        "lerobot": _lerobot_features(robot),
         "bench": describe_appearance(load_schema(spec.capabilities.bench))
         if spec.capabilities.bench
         else None,
     }
+
+
+def _lerobot_features(robot: Robot) -> list[list[Any]] | None:
+    """Return LeRobot's feature, scale and offset of each joint; None if the description lacks one."""
+    if robot.lerobot is None:
+        return None
+    tables = robot.lerobot.joints
+    features = []
+    for group in robot.groups:
+        for joint in group.joints:
+            if joint not in tables.get(group.name, {}):
+                return None
+            table = tables[group.name][joint].model_dump(exclude_none=True)
+            feature = JointFeature.from_table(joint, table)
+            features.append([feature.feature, feature.scale, feature.offset])
+    return features
 
 
 def _phase(of: Components) -> str:
@@ -160,11 +179,16 @@ def _link(of: Components, inbox: Inbox, now: float) -> dict[str, Any]:
     record, reception = of.shared.observation.read(), inbox.reception_report
     never = int(record["sequence"]) == 0
     ages = {"joints": math.inf if never else now - float(record["joints_captured"])}
+    sizes: dict[str, list[int]] = {}  # height, width of the newest picture
     for index, camera in enumerate(of.shared.layout.cameras):
         received = bool(record["picture_number"][index])
         ages[camera] = now - float(record["picture_captured"][index]) if received else math.inf
+        size = of.shared.pictures[camera].shape(int(record["picture_number"][index])) if received else None
+        if size is not None:
+            sizes[camera] = [int(size[0]), int(size[1])]
     return {
         "ages": ages,
+        "picture_sizes": sizes,
         "rates": dict(reception.rates),
         "faults": dict(reception.faults),
         "cameras": {key: dict(status) for key, status in reception.cameras.items()},

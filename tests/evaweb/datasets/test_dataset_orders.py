@@ -231,7 +231,7 @@ def test_a_dataset_of_the_hub_is_pulled_under_a_new_name(
 
     about = SimpleNamespace(sha="abc", siblings=[])
     api = SimpleNamespace(dataset_info=lambda *given, **more: about)
-    client = SimpleNamespace(HfApi=lambda: api, snapshot_download=download)
+    client = SimpleNamespace(HfApi=lambda token: api, snapshot_download=download)
     monkeypatch.setitem(sys.modules, "huggingface_hub", client)
     pulled = done(what="pull", repository="lab/cups", to="theirs")
     assert (pulled["dataset"], pulled["episodes"], pulled["frames"]) == ("datasets/theirs", 3, 21)

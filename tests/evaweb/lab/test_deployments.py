@@ -65,7 +65,10 @@ def test_a_draft_has_what_was_chosen_and_its_command():
             {"transport": {"kind": "zmq", "stalled_after_s": "soon"}},
             "stalled_after_s = 'soon'; allowed: a number",
         ),
-        ({"transport": {"kind": "pigeon"}}, r"transport.kind = 'pigeon'; allowed: dataset, ros1, ros2, zmq"),
+        (
+            {"transport": {"kind": "pigeon"}},
+            r"transport.kind = 'pigeon'; allowed: dataset, lerobot, ros1, ros2, zmq",
+        ),
         ({"cameras.cam_high": {"kind": "v4l2", "device": "webcam"}}, r"cameras.cam_high.device = 'webcam'"),
         ({"cameras.cam_high": {"kind": "v4l2"}}, r"cameras.cam_high.device is missing"),
         ({"transport": {"kind": "zmq", "sub_endpoint": "tcp://10.0.0.1:1"}}, "insecure_link = true"),

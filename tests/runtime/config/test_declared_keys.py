@@ -48,6 +48,7 @@ ELSEWHERE = {
     "runtime.config.schema.PanelSettings": ("runtime/clients/panel/settings.py", '["panel"]'),
     "runtime.transports.ros.topics.GroupTopics": ("runtime/transports/ros/topics.py", '"{key}"'),
     "robots.description.RosGroupTable.eef_command": ("runtime/transports/ros/topics.py", '"{key}"'),
+    "robots.description.LerobotJointTable": ("runtime/lerobot/settings.py", "features[joint].model_dump()"),
     # Without it a validator refuses what leaves this machine.
     "runtime.transports.ros1.Link.insecure_link": ("runtime/transports/ros1.py", "self.insecure_link"),
     "runtime.transports.ros2.Link.insecure_link": ("runtime/transports/ros2.py", "self.insecure_link"),

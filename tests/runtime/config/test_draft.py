@@ -74,7 +74,7 @@ def test_what_is_of_no_such_type_is_named_with_what_is_allowed(typed, said):
 
 def test_a_kind_that_there_is_not_is_named_with_those_there_are():
     with pytest.raises(
-        ConfigurationError, match=r"transport.kind = 'pigeon'; allowed: dataset, ros1, ros2, zmq"
+        ConfigurationError, match=r"transport.kind = 'pigeon'; allowed: dataset, lerobot, ros1, ros2, zmq"
     ):
         draft.entries("transport", "pigeon")
 

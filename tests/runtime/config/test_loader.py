@@ -15,6 +15,7 @@ from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
 from runtime.core.settings import Settings
 from runtime.station.checks import check_deployment
+from tests.runtime.lerobot.fake_lerobot import FakeLerobot
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 SMALL = """\
@@ -289,15 +290,15 @@ def test_an_unknown_table_is_an_unknown_key(small):
         ("bus.estop_port=5", "bus.estop_port = 5: the bus has no ports any more, but Unix sockets"),
         (
             "policy.kind=mok",
-            "policy.kind = 'mok': must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
+            "policy.kind = 'mok': must be one of 'external', 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
         ),
         (
             "policy.kind=5",
-            "policy.kind = 5: must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
+            "policy.kind = 5: must be one of 'external', 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
         ),
         (
             "policy={horizon=3}",
-            "policy.kind is missing: must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
+            "policy.kind is missing: must be one of 'external', 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
         ),
         (
             "strategy={kind=['sync']}",
@@ -420,6 +421,7 @@ def test_every_deployment_that_comes_with_it_loads_and_survives_the_way_to_the_f
     needed = {
         "base.toml": ["robot=r", "transport.kind=zmq", "policy.kind=mock"],
         "replay_dataset.toml": [f"transport.path={tmp_path}", f"policy.path={tmp_path}"],
+        "so101.toml": [f'transport.python="{FakeLerobot(tmp_path).python}"'],
     }
     resolved = load(path, needed.get(path.name, []))
     handed_over = json.loads(json.dumps(dict(resolved.tree), allow_nan=False))
@@ -499,7 +501,9 @@ def test_a_wrong_change_names_where_it_came_from(write):
     own = load(write())
     with pytest.raises(ConfigurationError, match=r"^setup: policy\.amplitud = 1: unknown key"):
         loader.apply_changes(own, {"policy": {"amplitud": 1}}, "setup")
-    with pytest.raises(ConfigurationError, match=r"^setup: policy\.kind = \[\]: must be one of 'gr00t'"):
+    with pytest.raises(
+        ConfigurationError, match=r"^setup: policy\.kind = \[\]: must be one of 'external', 'gr00t'"
+    ):
         loader.apply_changes(own, {"policy": {"kind": []}}, "setup")
 
 

@@ -45,6 +45,9 @@ class Hub:
     uploads: list[str] = field(default_factory=list)  # SHA-256 of large files, in the order of their arrival
     operations: list[tuple[str, str]] = field(default_factory=list)  # of commits: what, path
     refused: set[str] = field(default_factory=set)  # tokens that are refused
+    tokens: list[str] = field(
+        default_factory=list
+    )  # of each request but those to a signed address, "" without
     url: str = ""
 
 
@@ -91,6 +94,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _handle(self) -> None:
         body, path = self._body(), unquote(urlsplit(self.path).path)
         token = (self.headers.get("Authorization") or "").removeprefix("Bearer ")
+        if not path.startswith("/object/"):
+            self.hub.tokens.append(token)
         if not path.startswith("/object/") and (not token or token in self.hub.refused):
             self._answer(401, {"error": "Invalid username or password."})
             return

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import shutil
 import sys
+import traceback
 from fnmatch import fnmatch
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pydantic import SecretStr
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import consistency, hub
@@ -26,6 +28,11 @@ class Client:
         self.has = Path()
         self.size = 10  # of each file [bytes]
         self.tags: list[str] = []
+        self.tokens: list[str | None] = []
+
+    def logged_in(self, token: str | None) -> Client:
+        self.tokens.append(token)
+        return self
 
     def create_repo(self, name: str, **given: Any) -> str:
         if self.refuses:
@@ -39,7 +46,8 @@ class Client:
     def upload_file(self, **given: Any) -> None:
         self.asked.append(("card", given))
 
-    def snapshot_download(self, name: str, *, local_dir: Path, **given: Any) -> None:
+    def snapshot_download(self, name: str, *, local_dir: Path, token: str | None, **given: Any) -> None:
+        self.tokens.append(token)
         self.asked.append(("download", {"name": name, **given}))
         for file in self.files:
             if any(fnmatch(file, pattern) for pattern in given["allow_patterns"]):
@@ -72,7 +80,9 @@ class Client:
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> Client:
     made = Client()
-    client = SimpleNamespace(HfApi=lambda: made, snapshot_download=made.snapshot_download)
+    client = SimpleNamespace(
+        HfApi=lambda token: made.logged_in(token), snapshot_download=made.snapshot_download
+    )
     monkeypatch.setitem(sys.modules, "huggingface_hub", client)
     return made
 
@@ -120,6 +130,34 @@ def test_what_the_hub_says_against_it_is_said(client: Client, dataset: Path) -> 
     client.refuses = "you are not logged in"
     with pytest.raises(RecordingError, match="not pushed to lab/cups: OSError: you are not logged in"):
         hub.push(dataset, "lab/cups")
+
+
+def test_a_token_is_the_only_one_used_and_in_no_error(client: Client, dataset: Path, tmp_path: Path) -> None:
+    token = SecretStr("hf_of_ann_0123456789")
+    client.has = dataset
+    hub.push(dataset, "lab/cups", token=token)
+    hub.pull("lab/cups", tmp_path / "back", token=token)
+    assert client.tokens == [token.get_secret_value()] * 3
+    client.refuses = f"illegal header 'Bearer {token.get_secret_value()}'"
+    for call in (
+        lambda: hub.push(dataset, "lab/cups", token=token),
+        lambda: hub.pull("lab/cups", tmp_path / "again", token=token),
+    ):
+        with pytest.raises(RecordingError, match=r"illegal header 'Bearer \(token\)'") as caught:
+            call()
+        assert token.get_secret_value() not in "".join(traceback.format_exception(caught.value))
+    with pytest.raises(ValueError, match="the token is empty"):
+        hub.pull("lab/cups", tmp_path / "again", token=SecretStr(""))
+
+
+def test_a_cancelled_push_ends_as_cancelled(client: Client, dataset: Path) -> None:
+    def cancel(step: str) -> None:
+        if "uploaded" in step:
+            raise KeyError(step)
+
+    with pytest.raises(KeyError):
+        hub.push(dataset, "lab/cups", tell=cancel)
+    assert [name for name, _ in client.asked] == ["create"]
 
 
 @pytest.mark.parametrize("name", ["cups", "lab/../cups", "https://lab/cups", ""])

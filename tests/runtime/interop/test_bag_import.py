@@ -420,8 +420,8 @@ def test_what_we_export_can_be_imported_again_row_by_row(tmp_path: Path, picture
         "joint_states",
         "joint_commands",
     ]
-    given = proposed.model_copy(update={"task_topic": "/eva/instruction"})
-    (result,) = import_bags([exported.path], given, tmp_path / "cups")
+    assert proposed.task_topic == "/eva/instruction"
+    (result,) = import_bags([exported.path], proposed, tmp_path / "cups")
     assert (result.problem, result.remarks) == ("", ())
     state, action = rows_of(tmp_path / "cups")
     np.testing.assert_array_equal(state[:, 0], np.arange(result.rows))

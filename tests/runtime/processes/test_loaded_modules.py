@@ -124,7 +124,7 @@ def test_each_process_loads_what_its_list_has(story, process):
 def test_control_loads_its_transport_and_no_policy_leader_camera_or_solver(story):
     modules = set(loaded(story[0], "control"))
     assert {name for name in modules if name.startswith("runtime.kinematics.")} == {"runtime.kinematics.base"}
-    kinds = {f"runtime.transports.{kind}" for kind in ("dataset", "ros1", "ros2", "zmq")}
+    kinds = {f"runtime.transports.{kind}" for kind in ("dataset", "lerobot", "ros1", "ros2", "zmq")}
     assert kinds & modules == {"runtime.transports.zmq"}
 
 

@@ -14,6 +14,7 @@ import robots
 from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError, TransportError
+from runtime.core.node_sockets import is_loopback
 from runtime.core.types import Observation, RobotCommand
 from runtime.transports import node_link, node_source
 from runtime.transports import zmq as link
@@ -141,7 +142,7 @@ def test_a_plain_link_beyond_this_machine_must_be_asked_for(key: str, endpoint: 
     ["tcp://127.0.0.1:1", "tcp://127.8.0.1:1", "tcp://localhost:1", "tcp://[::1]:1", "ipc:///tmp/x"],
 )
 def test_addresses_of_this_machine_are_loopback(endpoint: str) -> None:
-    assert link.is_loopback(endpoint)
+    assert is_loopback(endpoint)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +154,7 @@ def test_an_impossible_port_is_refused_because_libzmq_would_wait_for_it_for_ever
 
 
 def test_a_source_address_does_not_pass_for_the_destination() -> None:
-    assert not link.is_loopback("tcp://127.0.0.1:0;192.168.1.5:5555")
+    assert not is_loopback("tcp://127.0.0.1:0;192.168.1.5:5555")
 
 
 def test_a_disabled_camera_must_exist() -> None:

@@ -73,12 +73,12 @@ def foreign_metadata(files: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def packed(files: Mapping[str, bytes], metadata: Mapping[str, Any] | None = None) -> io.BytesIO:
-    """The zip of it."""
+    """The zip of it, the same to the byte at any time of the day."""
     target = io.BytesIO()
-    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path, content in files.items():
-            archive.writestr(path, content)
-        archive.writestr(METADATA, json.dumps(metadata or foreign_metadata(files)))
+    described = json.dumps(metadata or foreign_metadata(files)).encode()
+    with zipfile.ZipFile(target, "w") as archive:
+        for path, content in {**files, METADATA: described}.items():
+            archive.writestr(zipfile.ZipInfo(path), content, zipfile.ZIP_DEFLATED)
     return target
 
 

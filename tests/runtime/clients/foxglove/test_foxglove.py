@@ -18,9 +18,10 @@ from websockets.exceptions import InvalidStatus, NegotiationError
 from websockets.sync.client import ClientConnection, connect
 
 from runtime.clients.foxglove import server as bridge_server
-from runtime.clients.foxglove.__main__ import serve, token_of
+from runtime.clients.foxglove.__main__ import TOKEN_FILE, serve
 from runtime.clients.foxglove.server import PROTOCOL, FoxgloveServer
 from runtime.clients.foxglove.topics import StationTopics, Topic
+from runtime.clients.listener import get_or_create_token
 from runtime.core.errors import ConfigurationError
 from runtime.core.sentences import Pattern, within
 from runtime.ipc.bus import Endpoints, Publisher
@@ -250,5 +251,7 @@ def test_beyond_this_machine_it_needs_a_certificate_and_the_token_is_for_this_ac
     options = argparse.Namespace(host="0.0.0.0", port=0, certificate=None, key=None, origin=[])
     with pytest.raises(ConfigurationError, match="beyond this machine it needs --certificate and --key"):
         serve(tmp_path / "bench", options, lambda: True)
-    assert token_of(tmp_path / "bench") == token_of(tmp_path / "bench")
+    assert get_or_create_token(tmp_path / "bench", TOKEN_FILE) == get_or_create_token(
+        tmp_path / "bench", TOKEN_FILE
+    )
     assert (tmp_path / "bench" / "foxglove.token").stat().st_mode & 0o777 == 0o600

@@ -99,7 +99,7 @@ def test_grippers_open_close_and_lock_in_their_own_units_and_nothing_else_does(n
     bench.say("motion", goal=here)
     bench.run(3)
     bench.shared.rings["orders"].push(encode(LockGrippers(shut.locks)))
-    bench.run(60)
+    bench.run(120)
     assert np.allclose(bench.sent[-1][list(robot.gripper_dims)], shut.locks[list(robot.gripper_dims)])
     others = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
     assert np.allclose(bench.sent[-1][others], here[others], atol=1e-6)

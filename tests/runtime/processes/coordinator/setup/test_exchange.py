@@ -81,7 +81,7 @@ REFUSED = {
     "a setting out of bounds": ({"policy": {"amplitude": 2.0}}, r"setup: policy\.amplitude = 2\.0: "),
     "an unknown kind": (
         {"policy": {"kind": "telepathy"}},
-        r"setup: policy\.kind = 'telepathy': must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi'",
+        r"setup: policy\.kind = 'telepathy': must be one of 'external', 'gr00t', 'lerobot', 'mock', 'none', 'openpi'",
     ),
     "an address that is none": (
         {"policy": {"kind": "openpi", "url": "http://there"}},

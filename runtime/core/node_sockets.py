@@ -1,13 +1,13 @@
-"""ZMQ sockets of a simulated node: one publishes observations, one receives commands."""
+"""ZMQ sockets of an execution node: one publishes observations, one receives commands."""
 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 
 import zmq
 
 from runtime.core.errors import SetupError
-from runtime.transports.zmq import is_loopback
 
 _QUEUED_FRAMES = 4
 _QUEUED_COMMANDS = 64  # few, because commands that queue while the node is suspended are old when it resumes
@@ -35,9 +35,14 @@ class Sockets:
         """Bound addresses of the sockets."""
         return {"obs_endpoint": address(self._publisher), "action_endpoint": address(self._subscriber)}
 
-    def received(self) -> list[bytes]:
-        """Return the commands received since the last call, in order; at most _DRAINED_COMMANDS."""
+    def received(self, wait_ms: int = 0) -> list[bytes]:
+        """Return the commands received since the last call, in order; at most _DRAINED_COMMANDS.
+
+        Wait at most `wait_ms` for the first.
+        """
         payloads: list[bytes] = []
+        if wait_ms:
+            self._subscriber.poll(wait_ms)
         with contextlib.suppress(zmq.Again):
             while len(payloads) < _DRAINED_COMMANDS:
                 payloads.append(self._subscriber.recv(zmq.NOBLOCK))
@@ -81,3 +86,16 @@ def address(socket: zmq.Socket[bytes]) -> str:
     raw = socket.getsockopt(zmq.LAST_ENDPOINT)
     assert isinstance(raw, bytes)
     return raw.rstrip(b"\0").decode()
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Return True if the endpoint cannot be reached from another machine."""
+    scheme, _, address = endpoint.partition("://")
+    if scheme in {"ipc", "inproc"}:
+        return True
+    host = address.rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return False

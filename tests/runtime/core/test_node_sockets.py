@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 from runtime.core.errors import SetupError
-from runtime.simulation.sockets import Sockets
+from runtime.core.node_sockets import Sockets
 from tests.processes import PATIENCE_S
 
 FREE = "tcp://127.0.0.1:0"
