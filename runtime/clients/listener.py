@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import argparse
 import secrets
+import socket
 import ssl
+import struct
 from ipaddress import ip_address
 from pathlib import Path
 
 from runtime.core.durable_files import write_durably
 from runtime.core.errors import ConfigurationError
+
+_LEAST_TOKEN = 32  # characters: a file that was emptied admits nobody
+_SEND_S = 5  # [s]
 
 
 def add_listener_arguments(parser: argparse.ArgumentParser, port: int) -> None:
@@ -26,12 +31,29 @@ def add_listener_arguments(parser: argparse.ArgumentParser, port: int) -> None:
 
 
 def get_or_create_token(station_dir: Path, file_name: str) -> str:
-    """Return the token in a file of the station, which is made once, and which only this account can read."""
+    """Return the token in a file of the station, which is made once, and which only this account can read.
+
+    Raises:
+        ConfigurationError: Other accounts can read the file.
+    """
     file = station_dir / file_name
-    if not file.exists():
+    if not file.exists() or len(file.read_bytes().strip()) < _LEAST_TOKEN:
         station_dir.mkdir(parents=True, exist_ok=True)
         write_durably(file, f"{secrets.token_urlsafe(24)}\n".encode(), mode=0o600)
+    if file.stat().st_mode & 0o077:
+        raise ConfigurationError(
+            f"{file} can be read by other accounts; allowed: mode 0600, or remove it for another"
+        )
     return file.read_text("ascii").strip()
+
+
+def limit_sending(connection: socket.socket) -> None:
+    """Let a send on a blocking connection fail if its peer has taken nothing for `_SEND_S` [s].
+
+    Without it a peer that does not read blocks the sender, and with it the keepalive of its websocket, for as long as
+    the peer exists.
+    """
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", _SEND_S, 0))
 
 
 def make_ssl_context(options: argparse.Namespace) -> ssl.SSLContext | None:

@@ -29,6 +29,9 @@ _FORGED = Pattern(
 
 SIGNED = "web:"  # prefix of holder names that require a signature
 PANEL = "panel:"  # prefix of holders at the station's own panel, a program of this account
+PROGRAMS = (
+    "robot:"  # prefix of programs that drive through a robot server, which no page can ask for the lease
+)
 SCRIPTS = "channel:"  # prefix of scripts' holders; the channel forwards them without knowing who they are
 # Roles outside the web: programs of this account, scripts that these forward, all others.
 LOCAL, SCRIPT, UNVERIFIED = "local", "script", "unverified"

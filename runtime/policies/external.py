@@ -30,7 +30,7 @@ _NO_ANSWER = Pattern(
 _UNREADABLE = Pattern("external.unreadable", "{program}: the answer of its robot server: {why}")
 _ROW = Pattern("external.row", "{program}: a row of {given}; expected {dim} finite numbers")
 
-_ROWS = 4  # per answer: a late request leaves the robot at the newest row, and does not starve it
+_ROWS = 15  # per answer: a late request leaves the robot at the newest row, and does not starve it
 _NEAR = 0.1  # [rad]: a joint whose reading is this near to its command stays at the command
 _ANSWER_LIMIT = 64 * 1024  # [bytes]
 
@@ -83,6 +83,7 @@ class ExternalPolicy(Policy):
 
     def reset(self) -> None:
         """Forget the row of an earlier episode. Raises: PolicyError."""
+        self._sent = {}  # what was passed on before is forgotten there too
         self._request({"do": "reset"})
 
     def close(self) -> None:

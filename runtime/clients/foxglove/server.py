@@ -24,6 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 
 from runtime.clients.foxglove.topics import EVENTS, Topic
+from runtime.clients.listener import limit_sending
 from runtime.interop.ros2_messages import schema_name, schema_text
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 PROTOCOL = "foxglove.sdk.v1"
 _EVENTS_KEPT = 64
 _MOST_CLIENTS = 8
+_MOST_SUBSCRIPTIONS = 256  # of a client; a station has some dozens of topics
+_MOST_TEXTS = 256  # that wait for a client
 _LARGEST = 1 << 16  # [bytes] of what a client sends
 _CLOSE_S = 2.0
 _HEAD = struct.Struct("<BIQ")
@@ -145,6 +148,7 @@ class FoxgloveServer:
         return None
 
     def _converse(self, connection: ServerConnection) -> None:
+        limit_sending(connection.socket)
         client = _Client(connection)
         info = {"op": "serverInfo", "name": self._name, "capabilities": [], "metadata": {}, "sessionId": ""}
         with self._lock:
@@ -185,6 +189,7 @@ class _Client:
     def send_text(self, message: Mapping[str, Any]) -> None:
         with self._ready:
             self._texts.append(json.dumps(message))
+            self._ended |= len(self._texts) > _MOST_TEXTS  # it does not read
             if message.get("op") == "unadvertise":
                 self._subscribed.clear()
                 self._waiting.clear()
@@ -208,7 +213,13 @@ class _Client:
                 if not all(0 <= number < 1 << 32 for number in chosen):
                     raise ValueError("a subscription's id is a u32")
                 with self._ready:
-                    self._subscribed |= chosen
+                    held = {channel: number for number, channel in self._subscribed.items()}
+                    held |= {channel: number for number, channel in chosen.items()}  # one per channel
+                    if len(held) > _MOST_SUBSCRIPTIONS:
+                        raise ValueError(f"at most {_MOST_SUBSCRIPTIONS} subscriptions")
+                    self._subscribed = {number: channel for channel, number in held.items()}
+                    for number in [one for one in self._waiting if one not in self._subscribed]:
+                        del self._waiting[number]
                 return
             if operation == "unsubscribe":
                 ended = [int(number) for number in asked["subscriptionIds"]]
@@ -218,7 +229,7 @@ class _Client:
                         self._waiting.pop(number, None)
                 return
             text = f"{operation or 'a binary message'!s:.40}: this server only shows; allowed: subscribe, unsubscribe"
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             text = f"the message cannot be read: {error!s:.200}"
         self.send_text({"op": "status", "level": _REFUSED, "message": text})
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import secrets
 import signal
 import sys
 import threading
@@ -27,6 +28,7 @@ from runtime.clients.robot_server.session import DriveSession
 from runtime.core import logs
 from runtime.core.errors import ConfigurationError, RuntimeFault, TransportError
 from runtime.ipc.bus import Endpoints
+from runtime.ipc.identity import PROGRAMS
 from runtime.ipc.lifeline import Lifeline
 
 TOKEN_FILE = "robot_server.token"
@@ -72,9 +74,12 @@ def serve(
     token, secure = get_or_create_token(station_dir, TOKEN_FILE), make_ssl_context(options)
     joints = JointsWatch(context, station_dir)
 
-    def make_session(program: str, number: int) -> DriveSession:
-        client = StationClient(station_dir)
-        client.holder = f"robot:{program}#{number} {client.holder.removeprefix('terminal:')}"
+    def make_session(program: str) -> DriveSession:
+        client, number = (
+            StationClient(station_dir),
+            secrets.token_hex(2),
+        )  # of this connection, also to another server
+        client.holder = f"{PROGRAMS}{program}#{number} {client.holder.removeprefix('terminal:')}"
         return DriveSession(client, RowExchange(context, station_dir, f"rows{number}"), program)
 
     server = RobotServer(token, make_session, joints.read, options.silence_s)

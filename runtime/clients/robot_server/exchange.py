@@ -27,7 +27,8 @@ _LOOKED_AT_S = 2.0  # pictures are passed on for this long after the program's l
 class LatestObservation:
     """Newest observation of the station, with the newest picture of each camera, RGB uint8 [H, W, 3].
 
-    `arrived` is its arrival here on this clock [s], `captured` are capture times on the station's own clock [s].
+    `arrived` is its arrival here on this clock [s], `captured` are capture times on the station's own clock [s], and
+    `picture_times` those of `pictures`, which may be older: pictures are passed on only while they are looked at.
     """
 
     arrived: float
@@ -38,6 +39,14 @@ class LatestObservation:
     commanded: Float32 | None = None  # [D]
     environment_state: Any = None
     pictures: Mapping[str, UInt8] = field(default_factory=dict)
+    picture_times: Mapping[str, float] = field(default_factory=dict)
+
+    def has_newest_pictures(self, cameras: frozenset[str]) -> bool:
+        """Return True if the pictures of these cameras are the newest that the station has."""
+        return all(
+            camera in self.pictures and self.picture_times[camera] == self.captured.get(camera)
+            for camera in cameras
+        )
 
 
 class RowExchange:
@@ -58,6 +67,7 @@ class RowExchange:
         self._newest: LatestObservation | None = None
         self._looked = -float("inf")
         self._ended = threading.Event()
+        self._path = path
         self._socket = context.socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.bind(f"ipc://{path}")
@@ -78,14 +88,14 @@ class RowExchange:
     def wait_for_observation(
         self, cameras: frozenset[str], newer_than: float, seconds: float
     ) -> LatestObservation | None:
-        """Return the newest observation that has arrived after `newer_than` [s] and has all `cameras`.
+        """Return the newest observation that has arrived after `newer_than` [s], with its pictures of all `cameras`.
 
         None if there is none within `seconds` [s].
         """
 
         def newest_observation() -> LatestObservation | None:
             newest = self._newest
-            fits = newest is not None and newest.arrived > newer_than and cameras <= newest.pictures.keys()
+            fits = newest is not None and newest.arrived > newer_than and newest.has_newest_pictures(cameras)
             return newest if fits else None
 
         with self._changed:
@@ -96,6 +106,7 @@ class RowExchange:
         """Stop answering; safe to call twice."""
         self._ended.set()
         self._thread.join()
+        self._path.unlink(missing_ok=True)
 
     def _serve(self) -> None:
         try:
@@ -112,7 +123,7 @@ class RowExchange:
                 self._store(message)
             elif message["do"] == "reset":
                 self.set_row(None)
-        except (CodecError, KeyError, TypeError) as error:  # of another version of the policy
+        except (CodecError, KeyError, TypeError, ValueError) as error:  # of another version of the policy
             log.exception("a request of the station cannot be used")
             return {"error": f"{type(error).__name__}: {error}"}
         with self._changed:
@@ -120,16 +131,18 @@ class RowExchange:
 
     def _store(self, message: dict[str, Any]) -> None:
         with self._changed:
-            before = self._newest.pictures if self._newest is not None else {}
+            before, times = (self._newest.pictures, self._newest.picture_times) if self._newest else ({}, {})
+            pictures, captured = message["pictures"], message["captured"]
             commanded = message.get("commanded")
             self._newest = LatestObservation(
                 arrived=self._clock(),
                 step=int(message["step"]),
                 joints=message["joints"],
-                captured=message["captured"],
+                captured=captured,
                 task=str(message["task"]),
                 commanded=None if commanded is None else np.asarray(commanded, np.float32),
                 environment_state=message.get("environment_state"),
-                pictures={**before, **message["pictures"]},
+                pictures={**before, **pictures},
+                picture_times={**times, **{camera: captured[camera] for camera in pictures}},
             )
             self._changed.notify_all()

@@ -12,9 +12,11 @@ import hmac
 import http
 import logging
 import re
+import socket
 import ssl
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -22,6 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection, serve
 
+from runtime.clients.listener import limit_sending
 from runtime.clients.robot_server.session import DriveSession, SessionError
 from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError, RuntimeFault
@@ -43,7 +46,7 @@ class RobotServer:
 
     Args:
         token: What the address needs (`?token=`).
-        make_session: Function of a program's name and the number of its connection: its session.
+        make_session: Function of a program's name: a session of its own.
         watch: Function that returns the newest joints of the station. Raises RuntimeFault.
         silence_s: Longest time between two requests during a run [s].
     """
@@ -51,7 +54,7 @@ class RobotServer:
     def __init__(
         self,
         token: str,
-        make_session: Callable[[str, int], DriveSession],
+        make_session: Callable[[str], DriveSession],
         watch: Callable[[], Mapping[str, Any]],
         silence_s: float,
     ) -> None:
@@ -86,9 +89,12 @@ class RobotServer:
             self._server.shutdown()
         with self._lock:
             remaining = list(self._connections.values())
-        for connection, thread in remaining:
-            connection.close(1001, "the robot server ends")
-            thread.join(_END_S)
+        for connection, _ in remaining:
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                connection.socket.shutdown(socket.SHUT_RDWR)
+        until = time.monotonic() + _END_S
+        for _, thread in remaining:
+            thread.join(max(0.0, until - time.monotonic()))
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse a client without the token, every page of a browser, and too many clients."""
@@ -110,22 +116,19 @@ class RobotServer:
         with self._lock:
             number = next(n for n in range(MOST_CLIENTS + 1) if n not in self._connections)
             self._connections[number] = connection, threading.current_thread()
-        conversation = Conversation(
-            lambda program: self._make_session(program, number),
-            self._watch,
-            lambda: connection.state is State.OPEN,
-        )
+        conversation = Conversation(self._make_session, self._watch, lambda: connection.state is State.OPEN)
+        limit_sending(connection.socket)
         try:
-            with contextlib.suppress(ConnectionClosed):
-                while True:
-                    connection.send(
-                        conversation.answer(
-                            connection.recv((conversation.is_driving and self._silence_s) or None)
-                        )
-                    )
+            while True:
+                patience = self._silence_s if conversation.is_driving else None
+                answer = conversation.answer(connection.recv(patience))
+                with conversation.sending():
+                    connection.send(answer)
         except TimeoutError:
             log.warning("%s has sent nothing for %g s: its run ends", conversation.program, self._silence_s)
             connection.close(1008, f"nothing was sent for {self._silence_s:g} s")
+        except (ConnectionClosed, OSError) as error:
+            log.info("the connection of %s has ended: %s", conversation.program or "a program", error)
         finally:
             conversation.close()
             with self._lock:
@@ -160,6 +163,18 @@ class Conversation:
         except RuntimeFault as fault:  # of the station, or a request that cannot be read
             return msgpack_arrays.pack({"error": str(fault), "over": False})
 
+    @contextlib.contextmanager
+    def sending(self) -> Iterator[None]:
+        """Note that an answer is being sent, for as long as the program does not read it."""
+        session = self._session
+        if session is not None:
+            session.sending_since = time.monotonic()
+        try:
+            yield
+        finally:
+            if session is not None:
+                session.sending_since = None
+
     def close(self) -> None:
         """End run and lease of this connection. Safe to call twice."""
         if self._session is not None:
@@ -168,6 +183,8 @@ class Conversation:
 
     def _answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         word = request.get("do")
+        if not isinstance(word, str):
+            raise SessionError(f"do is a {type(word).__name__}; expected a text")
         if word == "watch":
             return self._watch()
         if word == "describe":
@@ -204,20 +221,18 @@ class Conversation:
     def _observe(self, session: DriveSession) -> dict[str, Any]:
         """Return the newest observation; of the cameras only pictures that this program does not have yet."""
         newest = session.observe()
-        new = {key: picture for key, picture in newest.pictures.items() if self._is_new(key, newest.captured)}
-        self._sent |= {key: newest.captured[key] for key in new}
+        times = newest.picture_times
+        new = {key: image for key, image in newest.pictures.items() if times.get(key) != self._sent.get(key)}
+        self._sent |= {key: times[key] for key in new if key in times}
         return {
             "step": newest.step,
             "task": newest.task,
-            "captured": dict(newest.captured),
+            "captured": {**newest.captured, **newest.picture_times},
             "joints": newest.joints,
             "commanded": newest.commanded,
             "environment_state": newest.environment_state,
             "pictures": new,
         }
-
-    def _is_new(self, camera: str, captured: Mapping[str, float]) -> bool:
-        return camera in captured and captured[camera] != self._sent.get(camera)
 
 
 def _parse(payload: str | bytes) -> Mapping[str, Any]:

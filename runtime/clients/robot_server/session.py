@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.clients.client import StationClient
+from runtime.clients.client import Refused, StationClient
 from runtime.clients.robot_server.exchange import LatestObservation, RowExchange
 from runtime.core.errors import RuntimeFault
 
@@ -22,6 +23,9 @@ CLOSE_S = 60.0
 _POLL_S = 0.1
 _FRESH_S = 0.5  # an older observation is not handed out [s]
 _PATIENCE_S = 3.0  # for the next observation [s]
+_READING_S = 10.0  # for the program to read an answer [s]
+_SEEDS = 2**31
+_RETRY_S = 1.0  # after the station has not answered [s]
 
 
 class SessionError(RuntimeFault):
@@ -53,6 +57,8 @@ class DriveSession:
         self._has_run = False
         self._has_lease = False
         self._episode = ""
+        self._run_number = 0  # of this session's run, 0 while it is unknown
+        self.sending_since: float | None = None  # an answer that the program has not read yet [s]
         self._dim = 0
         self._cameras: frozenset[str] = frozenset()
         self._ended = threading.Event()
@@ -78,7 +84,7 @@ class DriveSession:
             task: Instruction; "" for that of the station.
             is_connected: False ends the set-up, because the program has gone.
             duration_s: Limit of the run [s]; None for that of the station.
-            seed: Resets the station's simulated bench; None leaves it as it is.
+            seed: Lays out the station's simulated bench; None draws one.
 
         Raises:
             SessionError: The set-up fails; the message is its reason.
@@ -96,25 +102,43 @@ class DriveSession:
             self._end_run()
             self._client.claim()
             self._has_lease = True
-            status = self._client.status()
-            facts = status["facts"]
-            self._dim, self._cameras = len(facts["joint_names"]), frozenset(facts["cameras"])
-            policy = {"kind": "external", "socket_file": self._exchange.socket_path, "client": self._program}
-            strategy = {"kind": "naive", "inference_rate": facts["rate"], "execution_horizon": None}
-            arguments: dict[str, Any] = {"policy": policy, "strategy": strategy}
-            arguments |= {"task": task} if task else {}
-            arguments |= {} if seed is None else {"bench": {"seed": seed}}
-            self._client.command("setup", **arguments)
-            status = self._client.wait(is_settled, SETUP_S)
-            if not status["state_is"]["ready"]:
-                raise SessionError(f"set-up failed: {status['reason']}")
-            self._exchange.begin()  # what the set-up has requested is no observation of the run
-            limit: dict[str, Any] = {"duration_s": duration_s} if duration_s else {}
-            ack = self._client.command("run", timeout=RUN_S, mode="continuous", **limit)
-            self._episode = str(ack.data.get("episode", ""))
-            self._over, self._is_stopped, self._has_run = "", False, True
+            try:
+                self._begin(task, is_settled, duration_s, seed)
+            except RuntimeFault:
+                if not self._has_run:
+                    self._release()
+                raise
         self._wait_for_observation(RUN_S)  # it follows the reset of the policy, which forgets an earlier row
         return {"episode": self._episode}
+
+    def _begin(
+        self,
+        task: str,
+        is_settled: Callable[[Mapping[str, Any]], bool],
+        duration_s: float | None,
+        seed: int | None,
+    ) -> None:
+        """Set the station up and begin a run; under the lock and the lease."""
+        status = self._client.status()
+        facts = status["facts"]
+        self._dim, self._cameras = len(facts["joint_names"]), frozenset(facts["cameras"])
+        policy = {"kind": "external", "socket_file": self._exchange.socket_path, "client": self._program}
+        strategy = {"kind": "naive", "inference_rate": facts["rate"], "execution_horizon": None}
+        arguments: dict[str, Any] = {"policy": policy, "strategy": strategy}
+        arguments |= {"task": task} if task else {}
+        if facts["bench"] is not None or seed is not None:  # a bench is laid out anew, as for every trial
+            arguments["bench"] = {"seed": secrets.randbelow(_SEEDS) if seed is None else seed}
+        self._client.command("setup", **arguments)
+        status = self._client.wait(is_settled, SETUP_S)
+        if not status["state_is"]["ready"]:
+            raise SessionError(f"set-up failed: {status['reason']}")
+        self._exchange.begin()  # what the set-up has requested is no observation of the run
+        limit: dict[str, Any] = {"duration_s": duration_s} if duration_s else {}
+        self._has_run, self._run_number, self._episode = True, 0, ""  # also if the answer does not arrive
+        ack = self._client.command("run", timeout=RUN_S, mode="continuous", **limit)
+        self._episode = str(ack.data.get("episode", ""))
+        self._run_number = int(self._client.status()["run"]["number"])
+        self._over, self._is_stopped = "", False
 
     def observe(self) -> LatestObservation:
         """Return the newest observation. Raises: SessionError if the run is over, or if there is none in time."""
@@ -144,14 +168,21 @@ class DriveSession:
         if not isinstance(row, np.ndarray) or row.dtype.kind != "f" or row.shape != (self._dim,):
             given = f"{row.dtype} {list(row.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
             raise SessionError(f"a row of {given}; expected {self._dim} floating-point numbers")
-        if not np.isfinite(row).all():
+        with np.errstate(over="ignore"):
+            sent = row.astype(np.float32)
+        if not np.isfinite(sent).all():
             raise SessionError(f"a row of {row.tolist()}; expected finite numbers")
-        self._exchange.set_row(row.astype(np.float32))
+        self._exchange.set_row(sent)
 
     def end(self) -> dict[str, Any]:
-        """Stop the run, wait until its episode is closed and return it. Raises: RuntimeFault."""
+        """Stop the run, wait until its episode is closed, release the lease and return the episode.
+
+        Raises: RuntimeFault.
+        """
         with self._lock:
-            return self._end_run()
+            ended = self._end_run()
+            self._release()
+            return ended
 
     def close(self, reason: str) -> None:
         """End the run, if one is open, and the lease; problems are logged. Safe to call twice."""
@@ -164,12 +195,7 @@ class DriveSession:
                 self._end_run()
             except RuntimeFault as fault:
                 log.warning("the run of %s could not be ended: %s", self._program, fault)
-            try:
-                if self._has_lease:
-                    self._client.release()
-            except RuntimeFault as fault:
-                log.info("the lease of %s had ended already: %s", self._program, fault)
-            self._has_lease = False
+            self._release()
             self._client.close()
         self._exchange.close()
 
@@ -184,8 +210,12 @@ class DriveSession:
         self._over = self._over or "the program has ended the run"
         self._has_run = False
         self._exchange.set_row(None)
-        if self._client.status()["state_is"]["run_open"]:
-            self._client.command("stop")
+        status = self._client.status()
+        is_ours = self._run_number in (0, status["run"]["number"])
+        if not status["state_is"]["run_open"] or not is_ours:
+            last = status["last_run"] or {}
+            return {"episode": self._episode, "status": str(last.get("status", "")) if is_ours else ""}
+        self._client.command("stop")
         status = self._client.wait(
             lambda state: not state["state_is"]["run_open"] and not state["recording"]["uuid"], CLOSE_S
         )
@@ -199,14 +229,43 @@ class DriveSession:
                 continue
             with self._lock:
                 try:
-                    self._client.renew()
-                    status = self._client.status()
+                    self._follow()
+                except Refused as refusal:  # somebody else has the lease, or the station was restarted
+                    self._has_lease = False
+                    self._note_end(f"{refusal}")
                 except RuntimeFault as fault:
                     self._note_end(f"{fault}")
-                    continue
-                if self._has_run and not status["state_is"]["going"]:
-                    self._is_stopped = bool(status["state_is"]["ready"])
-                    self._note_end(f"the station is {status['state']}: {status['reason']}")
+                    self._ended.wait(_RETRY_S)
+                except Exception:  # the run must not go on without the thread that ends it
+                    log.exception("the session of %s", self._program)
+                    self._note_end("the robot server has failed: its log says why")
+                    self._ended.wait(_RETRY_S)
+
+    def _follow(self) -> None:
+        """Renew the lease and read the station's state; end what a program that does not read its answers holds."""
+        since = self.sending_since
+        if since is not None and time.monotonic() - since > _READING_S:
+            self._note_end(f"the program has not read an answer for {_READING_S:g} s")
+            self._end_run()
+            self._release()
+            return
+        self._client.renew()
+        status = self._client.status()
+        holder = status["lease"]["holder"]
+        if holder != self._client.holder:
+            raise Refused(f"{holder or 'nobody'} holds the lease")
+        if self._has_run and not status["state_is"]["going"]:
+            self._is_stopped = bool(status["state_is"]["ready"])
+            self._note_end(f"the station is {status['state']}: {status['reason']}")
+
+    def _release(self) -> None:
+        """Release the lease, if there is one."""
+        try:
+            if self._has_lease:
+                self._client.release()
+        except RuntimeFault as fault:
+            log.info("the lease of %s had ended already: %s", self._program, fault)
+        self._has_lease = False
 
     def _note_end(self, why: str) -> None:
         if self._has_run and not self._over:

@@ -13,9 +13,11 @@ every further call raises StationError with the reason.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -28,6 +30,8 @@ URL_VARIABLE = "EVAWEB_ROBOT_URL"
 _BEGIN_S = 300.0  # a set-up drives to the start pose and waits for every camera
 _ANSWER_S = 15.0
 _LARGEST = 1 << 28  # [bytes] of an answer
+# From version 15 on websockets connects through the proxy of the environment, which a robot is not behind.
+_NO_PROXY: dict[str, Any] = {"proxy": None} if int(version("websockets").partition(".")[0]) >= 15 else {}
 
 
 class StationError(RuntimeError):
@@ -122,7 +126,12 @@ class Station:
             raise StationError(
                 f"no address of a station: give the url that its robot server prints, or ${URL_VARIABLE}"
             )
+        if not self._url.startswith(("ws://", "wss://")):
+            raise StationError(
+                "the url of a station begins with ws:// or wss://, as its robot server prints it"
+            )
         self._program = program
+        self._has_begun = False
         self._connection: ClientConnection | None = None
         self._pictures: dict[str, np.ndarray] = {}
 
@@ -165,13 +174,14 @@ class Station:
         Args:
             task: Instruction; "" for that of the station.
             duration_s: Limit of the run [s]; None for that of the station.
-            seed: Resets a simulated bench; None leaves it as it is.
+            seed: Lays out a simulated bench; None draws one.
 
         Raises:
             StationError: The station refuses, for the reason in the message.
         """
         self._pictures = {}
         answer = self._request("begin", _BEGIN_S, task=task, duration_s=duration_s, seed=seed)
+        self._has_begun = True
         return str(answer["episode"])
 
     def observe(self) -> Observation:
@@ -186,6 +196,7 @@ class Station:
 
     def end(self) -> str:
         """Stop the run, wait until its episode is closed and return it. Raises: StationError."""
+        self._has_begun = False
         return str(self._request("end", _BEGIN_S)["episode"])
 
     def watch(self) -> Mapping[str, np.ndarray]:
@@ -196,8 +207,15 @@ class Station:
         return self._request("watch", _ANSWER_S)
 
     def close(self) -> None:
-        """Close the connection, which ends a run of this client. Safe to call twice."""
-        connection, self._connection = self._connection, None
+        """End a run of this client, and close the connection. Safe to call twice."""
+        if self._has_begun and self._connection is not None:
+            with contextlib.suppress(StationError):  # the station ends it too when the connection has gone
+                self.end()
+        self._drop()
+
+    def _drop(self) -> None:
+        """Close the connection as it is, without another request."""
+        connection, self._connection, self._has_begun = self._connection, None, False
         if connection is not None:
             connection.close()
 
@@ -205,16 +223,29 @@ class Station:
         try:
             if self._connection is None:
                 opening = connect(
-                    self._url, max_size=_LARGEST, compression=None, ping_interval=None, open_timeout=10.0
+                    self._url,
+                    max_size=_LARGEST,
+                    compression=None,
+                    ping_interval=None,
+                    open_timeout=10.0,
+                    **_NO_PROXY,
                 )
                 self._connection = opening.__enter__()  # newer versions of websockets open it only then
             request = {"do": word, "program": self._program, **arguments}
             self._connection.send(msgpack.packb(request, default=_encode))
             answer = msgpack.unpackb(self._connection.recv(patience), object_hook=_decode)
         except (OSError, TimeoutError, WebSocketException, ValueError) as error:
-            self.close()  # an answer that comes later belongs to no other request
+            self._drop()  # an answer that comes later belongs to no other request
             place = self._url.partition("?")[0]
-            raise StationError(f"{place}: {word}: {error or type(error).__name__}", is_over=True) from error
+            text = (
+                str(error).replace(self._url, place) or type(error).__name__
+            )  # the token is for nobody's log
+            raise StationError(f"{place}: {word}: {text}", is_over=True) from None
+        except (
+            BaseException
+        ):  # an interrupted request leaves an answer, which the next one would take for its own
+            self._drop()
+            raise
         if "error" in answer:
             is_over, is_stopped = bool(answer.get("over")), bool(answer.get("stopped"))
             raise StationError(str(answer["error"]), is_over, is_stopped)

@@ -15,6 +15,8 @@ export function pageProblem(kind, { fresh, role, lease, snapshot }) {
   if (role === "viewer") return t("page.reasons.viewer", "a viewer watches; an administrator can make you an operator");
   if (lease === "free") return t("page.reasons.free", "take the station first");
   if (lease === "elsewhere") return t("page.reasons.elsewhere", "another page of yours commands the station; take it here first");
+  // A program that drives cannot be asked for the station: its runs may be stopped by any operator.
+  if (STOPPING.includes(kind) && lease === "other" && snapshot.lease?.holder.startsWith("robot:")) return commandProblem(kind, snapshot);
   if (lease !== "mine") return t("page.reasons.other", "someone else commands the station; ask for it");
   return commandProblem(kind, snapshot);
 }

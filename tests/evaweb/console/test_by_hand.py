@@ -118,6 +118,17 @@ def store(**more: Any) -> dict[str, Any]:
     return {**page, "snapshot": {**state_flags("running"), "mode": "continuous", "allowed": [], **more}}
 
 
+def test_any_operator_may_stop_a_program_that_drives_and_nothing_else() -> None:
+    driven = store(lease="other", allowed=["stop", "halt", "tune"])
+    driven["snapshot"]["lease"] = {"holder": "robot:lerobot#0"}
+    assert refusals("stop", driven) == refusals("halt", driven) == [""]
+    ask = ["someone else commands the station; ask for it"]
+    assert refusals("tune", driven) == ask
+    assert refusals("stop", driven | {"role": "viewer"}) != [""]
+    driven["snapshot"]["lease"] = {"holder": "web:anna:1"}
+    assert refusals("stop", driven) == ask
+
+
 def test_a_stop_needs_no_news_and_everything_else_does() -> None:
     old, others = store(fresh=False), store(fresh=False, lease="other")
 

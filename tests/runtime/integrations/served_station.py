@@ -60,7 +60,8 @@ class ServedStation:
         step = len(self.rows)
         captured = {"joints": step + 0.25, "cam_high": step + 0.5}
         pictures = {"cam_high": np.full((4, 6, 3), step, np.uint8)}
-        return LatestObservation(0.0, step, joints, captured, "fold", joints, None, pictures)
+        times = {"cam_high": captured["cam_high"]}
+        return LatestObservation(0.0, step, joints, captured, "fold", joints, None, pictures, times)
 
     def act(self, row: np.ndarray) -> None:
         self._refuse()
@@ -86,7 +87,7 @@ def served() -> Iterator[ServedStation]:
         "measured": np.array([0.5, 0.5], np.float32),
         "commanded": np.array([np.nan, np.nan], np.float32),
     }
-    server = RobotServer("token", lambda program, number: station, lambda: joints, 600.0)  # type: ignore[arg-type,return-value]
+    server = RobotServer("token", lambda program: station, lambda: joints, 600.0)  # type: ignore[arg-type,return-value]
     station.url = f"ws://127.0.0.1:{server.open('127.0.0.1', 0)}/?token=token"
     try:
         yield station

@@ -132,7 +132,17 @@ def test_the_program_gets_the_newest_picture_of_each_camera_and_each_travels_onc
     }
     assert (newest.step, newest.task, newest.captured["cam_left_wrist"]) == (2, "fold", 2.0)
     clock.now = 10.0  # nobody has asked for an observation since
-    policy.infer(observation(3, cam_high=3.0, cam_left_wrist=3.0))
-    policy.infer(observation(4, cam_high=4.0, cam_left_wrist=4.0))
+    for step in (3, 4):
+        policy.infer(observation(step, cam_high=step, cam_left_wrist=step))
     assert travelled[2:] == [["cam_high", "cam_left_wrist"], []]
-    assert exchange.wait_for_observation(both, 10.0, 0.0) is None
+    clock.now = 10.1
+    assert exchange.wait_for_observation(both, 9.9, 0.0) is None  # its pictures are older than its joints
+    for step in (5, 6):  # the first answer wants pictures again
+        policy.infer(observation(step, cam_high=step, cam_left_wrist=step))
+    newest = exchange.wait_for_observation(both, 9.9, 0.0)
+    assert newest is not None
+    assert (newest.step, newest.picture_times, newest.pictures["cam_high"][0, 0, 0]) == (
+        6,
+        dict.fromkeys(both, 6),
+        6,
+    )

@@ -15,7 +15,15 @@ from tests.sources import ROOT
 BASE = {"msgpack", "numpy", "zmq"}
 HEAVY = {"PIL", "av", "cv2", "jax", "numba", "pyarrow", "pydantic", "scipy", "simplejpeg", "websockets"}
 HEAVY |= {"django", "evaweb", "h5py", "psutil", "torch"}
-READING = {"robots", "runtime.config", "runtime.core", "runtime.ipc", "runtime.motion", "runtime.processes"}
+READING = {
+    "robots",
+    "runtime.benches",
+    "runtime.config",
+    "runtime.core",
+    "runtime.ipc",
+    "runtime.motion",
+    "runtime.processes",
+}
 READING |= {
     "runtime.recording",
     "runtime.safety",
@@ -33,8 +41,8 @@ PARTS = {
     "coordinator": (
         READING
         | {
-            "runtime.benches",
             "runtime.cameras",
+            "runtime.lerobot",
             "runtime.policies",
             "runtime.spaces",
             "runtime.teleoperators",
@@ -43,7 +51,7 @@ PARTS = {
     ),
     "supervisor": (
         READING | {"runtime.link", "runtime.policies", "runtime.spaces"},
-        {"pydantic", "av"},
+        {"pydantic", "av", "websockets"},  # which checks the address of a policy server
     ),
 }
 # Modules of variants: of the kinds that the deployment names, and what these stand on.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import ARGUMENTS, read
-from runtime.ipc.identity import at_the_panel, display_name
+from runtime.ipc.identity import PROGRAMS, at_the_panel, display_name
 from runtime.ipc.messages import Ack, AckStatus, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
@@ -209,11 +209,13 @@ class SessionMachine:
     def _stops_without(self, command: Command) -> bool:
         """Return True if the command is a stop that needs no lease.
 
-        That is so if it comes from the station's panel, or the run is unattended.
+        That is so if it comes from the station's panel, if the run is unattended, or if another program drives.
         """
         if command.kind not in STOPPING:
             return False
-        return self._unattended or at_the_panel(command)
+        lease = self._lease.current(self._now())
+        is_driven = lease is not None and lease.holder.startswith(PROGRAMS)
+        return self._unattended or is_driven or at_the_panel(command)
 
     def _staleness(self, command: Command) -> str:
         if command.boot != self._boot:

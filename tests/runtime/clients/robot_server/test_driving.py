@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zmq
 from websockets.exceptions import InvalidStatus
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
 
 from runtime.clients.listener import get_or_create_token
@@ -37,11 +41,13 @@ class Served(Bench):
     """A station whose robot server is at `url`."""
 
     def __init__(self, folder: Path, silence_s: float = 600.0, **settings: Any) -> None:
+        self._numbers = count()
         super().__init__(folder, real="external", **settings)
         self.server = RobotServer(TOKEN, self._session, dict, silence_s)
         self.url = f"ws://127.0.0.1:{self.server.open('127.0.0.1', 0)}/?token={TOKEN}"
 
-    def _session(self, program: str, number: int) -> DriveSession:
+    def _session(self, program: str) -> DriveSession:
+        number = next(self._numbers)
         client = _Patient(self, f"robot:{program}#{number}")
         return DriveSession(client, RowExchange(self.context, self.folder, f"rows{number}"), program)
 
@@ -133,6 +139,13 @@ def test_a_stop_by_its_limit_ends_the_run_with_a_station_that_is_ready_for_anoth
     program.observe()
 
 
+def test_any_operator_may_stop_it_without_its_lease(bench: Served, program: Station) -> None:
+    program.begin()
+    _Patient(bench, "terminal:anna").command("stop")
+    error = refused(program.observe)
+    assert (error.is_over, error.is_stopped) == (True, True)
+
+
 def test_a_lost_lease_is_an_error_of_its_next_call(bench: Served, program: Station) -> None:
     program.begin()
     lease, now = bench.station.coordinator.lease, bench.station.clock.now
@@ -150,6 +163,7 @@ def test_a_lost_lease_is_an_error_of_its_next_call(bench: Served, program: Stati
     [
         (np.zeros(3), r"a row of float32 \[3\]; expected 14 floating-point numbers"),
         (np.full(DIM, np.nan), "finite numbers"),
+        (np.full(DIM, 1e300), "finite numbers"),
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_and_the_run_goes_on(
@@ -168,6 +182,54 @@ def test_nothing_is_driven_without_a_run(bench: Served, program: Station) -> Non
         assert refused(call).is_over
     assert program.end() == ""
     assert bench.station.coordinator.lease.current(bench.station.clock.now()) is None
+
+
+def test_an_interrupted_request_leaves_no_answer_to_another(
+    bench: Served, program: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program.begin()
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    connection = program._connection
+    assert connection is not None
+    monkeypatch.setattr(connection, "recv", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        program.observe()
+    assert not program.is_connected
+    bench.reach(SessionState.READY)
+    assert "begin one first" in str(refused(program.observe))
+
+
+def test_a_program_that_reads_no_answer_loses_its_run_and_its_lease(
+    bench: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sessions, "_READING_S", 0.1)
+    request = msgpack.packb({"do": "observe"})
+    with connect(bench.url, max_size=None) as frozen:
+        frozen.recv_bufsize = 1
+        frozen.send(msgpack.packb({"do": "begin", "program": "frozen"}))
+        assert b"episode" in frozen.recv(PATIENCE_S)  # type: ignore[operator]
+        frozen.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        frozen.protocol_mutex.acquire()  # its thread reads nothing from here on
+        try:
+            frozen.socket.setblocking(True)
+            for _ in range(2000):
+                frozen.socket.sendall(Frame(Opcode.BINARY, request).serialize(mask=True))
+            bench.reach(SessionState.READY)
+            lease = bench.station.coordinator.lease
+            eventually(lambda: lease.current(bench.station.clock.now()) is None, "no lease is left")
+        finally:
+            frozen.protocol_mutex.release()
+
+
+def test_one_session_follows_another_without_waiting(bench: Served) -> None:
+    for _ in range(3):
+        with Station(bench.url, program="loop") as program:
+            program.begin()
+            program.observe()
+    bench.reach(SessionState.READY)
 
 
 def test_another_program_is_refused_with_the_name_of_the_holder(bench: Served, program: Station) -> None:
@@ -292,6 +354,12 @@ def test_the_command_serves_at_an_address_with_a_token_of_this_account(tmp_path:
         address = eventually(lambda: found, "the address")[0]
         assert address.endswith(f"/?token={get_or_create_token(folder, TOKEN_FILE)}")
         assert (folder / TOKEN_FILE).stat().st_mode & 0o777 == 0o600
+        (folder / "emptied.token").touch()
+        assert len(get_or_create_token(folder, "emptied.token")) == 32
+        (folder / TOKEN_FILE).chmod(0o644)
+        with pytest.raises(ConfigurationError, match="can be read by other accounts"):
+            get_or_create_token(folder, TOKEN_FILE)
+        (folder / TOKEN_FILE).chmod(0o600)
         with Station(address) as program:
             assert "bench" in str(refused(program.describe))  # no such station runs
     finally:
@@ -306,5 +374,8 @@ def test_a_client_without_an_address_says_so(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("EVAWEB_ROBOT_URL", raising=False)
     with pytest.raises(StationError, match="EVAWEB_ROBOT_URL"):
         Station()
-    with pytest.raises(StationError, match=r"ws://127\.0\.0\.1:1/: describe: .*refused"):
-        Station("ws://127.0.0.1:1/?token=x").describe()
+    with pytest.raises(StationError, match=r"ws://127\.0\.0\.1:1/: describe: .*refused") as unreachable:
+        Station("ws://127.0.0.1:1/?token=hidden").describe()
+    with pytest.raises(StationError, match="begins with ws://") as unusable:
+        Station("http://127.0.0.1:1/?token=hidden")
+    assert "hidden" not in f"{unreachable.value} {unusable.value}"

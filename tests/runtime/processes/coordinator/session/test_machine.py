@@ -418,6 +418,15 @@ def test_the_panel_stops_whoever_holds_the_lease_and_does_nothing_else(state, ki
     assert bench.session.state is after
 
 
+def test_a_program_that_drives_may_be_stopped_by_others_and_commanded_by_it_alone():
+    bench = Bench(S.RUNNING)
+    bench.clock.advance(5.0)
+    assert bench.give("lease_claim", holder="robot:theirs#0", epoch=2).status == "accepted"
+    assert bench.give("resume", holder="ben").reason == "robot:theirs#0 holds the lease"
+    assert bench.give("stop", holder="ben").status == "accepted"
+    assert bench.session.state is S.READY
+
+
 def test_a_run_that_nobody_commands_takes_stops_of_everybody_and_no_other_command():
     bench = Bench(S.RUNNING)
     bench.clock.advance(5.0)
