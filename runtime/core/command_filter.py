@@ -15,6 +15,7 @@ from runtime.core.types import Float64
 
 ANONYMOUS = "anonymous"  # name of clients that send none, as older versions
 MASTER_SILENCE = 1.0  # [s] silence after which another client may become master
+_AHEAD = 0.05  # [s] by which a stamp of the same clock may be ahead of its arrival: times are rounded
 _TOLERANCE = 1e-5  # limits are transmitted as float32
 _MESSAGE_LIMIT = 1024 * 1024  # [bytes]; a command has a few hundred
 
@@ -24,7 +25,9 @@ class CommandFilter:
 
     `refused` counts rejected messages by reason. A target is also refused if it was sent more than `deadline` [s] ago
     according to the master's own clock, provided that this clock advances; with `same_clock`, master and node have one
-    clock, and the age of every target is known. `ack` is the `seq` of the master's newest
+    clock, the age of every target is known, and one without a stamp, or with one of the future, is refused. `sent` is
+    the time of the newest target's sending on the node's clock, that of its arrival if it is unknown, and `source` what
+    drives the robot by it. `ack` is the `seq` of the master's newest
     message that took effect, None if the master does not number its messages. Targets have `dim` numbers within
     `limits` (lower and upper [D]), if given.
     """
@@ -46,6 +49,8 @@ class CommandFilter:
         self._clock = ClockMap()
         self.master: str | None = None
         self.ack: int | None = None
+        self.sent = float("-inf")
+        self.source = ""
         self.refused: Counter[str] = Counter()
 
     def accept_target(self, payload: bytes, arrival: float) -> Float64 | None:
@@ -101,24 +106,28 @@ class CommandFilter:
 
     def _target(self, message: dict[Any, Any], arrival: float) -> Float64 | None:
         action = message.get("action")
-        reason = "stale" if self._late(message.get("t"), arrival) else self._wrong(action)
+        stamp, source = message.get("t"), message.get("source")
+        reason = "stale" if self._late(stamp, arrival) else self._wrong(action)
         if reason:
             self.refused[reason] += 1
             return None
         self._accepted = arrival
+        self.sent = cast(float, stamp) if self._same_clock else arrival
+        self.source = source if isinstance(source, str) else ""
         target = np.asarray(action, np.float64)
         return target if self._limits is None else np.clip(target, *self._limits)
 
     def _late(self, stamp: object, arrival: float) -> bool:
         """Return True if the target was sent longer ago than the deadline.
 
-        Return False if the age of the target is unknown. It is unknown if the target has no stamp, or if the sender's
-        clock does not advance.
+        Without one clock, return False if the age of the target is unknown. It is unknown if the target has no stamp,
+        or if the sender's clock does not advance.
         """
-        if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
-            return False
+        known = type(stamp) in (int, float) and math.isfinite(cast(float, stamp))
         if self._same_clock:
-            return arrival - cast(float, stamp) > self._deadline
+            return not known or not -_AHEAD <= arrival - cast(float, stamp) <= self._deadline
+        if not known:
+            return False
         before, self._stamp = self._stamp, cast(float, stamp)
         if before == self._stamp:
             return False  # the clock does not advance, so age is unknown

@@ -69,7 +69,10 @@ def bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
         SetupError: If the address is in use, or reachable from other machines without `insecure`.
     """
     if not insecure and not is_loopback(endpoint):
-        raise SetupError(f"{endpoint} can be reached from other machines; add --insecure-link to allow it")
+        raise SetupError(
+            f"{endpoint} can be reached from other machines; add --insecure-link, or in a file insecure_link = true, "
+            "to allow it"
+        )
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
     socket.setsockopt(zmq.SNDHWM, _QUEUED_FRAMES)
     socket.setsockopt(zmq.RCVHWM, _QUEUED_COMMANDS)

@@ -58,6 +58,7 @@ class Order:
     goal: Float64 | None = None  # [D] end of a "motion"; NaN: where the joint stops when it brakes
     reason: str = ""
     mode: Mode = "continuous"  # of a "follow"
+    source: ControlSource = "policy"  # of the rows of a "follow"
     speed: float = 1.0  # share of the speed of generated motions that a "motion" may use
 
 

@@ -11,12 +11,22 @@ import importlib
 import pkgutil
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 _PACKAGES = {"robot": "lerobot.robots", "teleoperator": "lerobot.teleoperators", "camera": "lerobot.cameras"}
 _CONFIGS = {"robot": "RobotConfig", "teleoperator": "TeleoperatorConfig", "camera": "CameraConfig"}
+_THIRD_PARTY = ("lerobot_robot_", "lerobot_teleoperator_", "lerobot_camera_")
+_NAMING = ("type", "port", "id", "calibration_dir")  # options that name a device
 _OPTIONS = {"robot": "robot", "teleoperator": "teleop"}  # of LeRobot's commands
+
+
+LOST = 3  # exit code of a host whose device is lost, for a reason that it has reported
+
+
+class DeviceLost(Exception):
+    """Error that a device cannot be connected, or is lost; the message says why."""
 
 
 class DeviceRefused(Exception):
@@ -33,7 +43,8 @@ def make_device(role: str, table: Mapping[str, Any]) -> Any:
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
-    absent = _import_types(role)
+    absent = [*_import_types(role), *_import_third_party()]
+    _require_rgb("device", table)
     base = getattr(importlib.import_module(_PACKAGES[role]), _CONFIGS[role])
     kind, known = table.get("type"), sorted(base.get_known_choices())
     if kind not in known:
@@ -67,8 +78,27 @@ def require_features(device: Any, joints: Sequence[str], images: Sequence[str]) 
             raise DeviceRefused(
                 f"{what} {', '.join(unknown)} do not exist; the device has {', '.join(allowed) or 'none'}"
             )
+    if twice := [name for name, count in Counter(joints).items() if count > 1]:
+        raise DeviceRefused(f"joints: more than one has the feature {', '.join(twice)}; allowed: one each")
     if left := [name for name in commanded if name not in joints]:
         raise DeviceRefused(f"joints: the device's action needs {', '.join(left)} too, which no joint has")
+
+
+def require_degrees(device: Any, joints: Sequence[str]) -> None:
+    """Raise DeviceRefused if the device says itself that these joints are not in degrees.
+
+    It says so by `use_degrees` of its configuration, or by the modes of the motors on its bus.
+    """
+    whole = getattr(getattr(device, "config", None), "use_degrees", True) is False
+    motors = getattr(getattr(device, "bus", None), "motors", None) or {}
+    modes = {f"{name}.pos": getattr(motor, "norm_mode", None) for name, motor in motors.items()}
+    if others := [
+        name for name in joints if whole or getattr(modes.get(name), "name", "DEGREES") != "DEGREES"
+    ]:
+        raise DeviceRefused(
+            f'joints: {", ".join(others)} have unit = "degrees", which the device does not use; allowed: '
+            "device.use_degrees = true, if it has that, or theirs and ours for each of these joints"
+        )
 
 
 def require_action(device: Any, joints: Sequence[str]) -> None:
@@ -80,12 +110,11 @@ def require_action(device: Any, joints: Sequence[str]) -> None:
 
 
 def calibration_command(role: str, table: Mapping[str, Any]) -> str:
-    """Return LeRobot's command that calibrates the device."""
-    options = [
-        f"--{_OPTIONS[role]}.{key}={value}"
-        for key, value in table.items()
-        if isinstance(value, str | int | float)
-    ]
+    """Return LeRobot's command that calibrates the device; of its configuration only what names the device.
+
+    Others may be secrets, and this is shown to everybody.
+    """
+    options = [f"--{_OPTIONS[role]}.{key}={table[key]}" for key in _NAMING if key in table]
     return shlex.join([sys.executable, "-m", "lerobot.scripts.lerobot_calibrate", *options])
 
 
@@ -101,6 +130,27 @@ def _import_types(role: str) -> list[str]:
             except Exception as error:
                 absent.append(f"{module.name} ({describe_error(error)})")
     return absent
+
+
+def _import_third_party() -> list[str]:
+    """Return the packages of others that cannot be imported here; LeRobot only logs that."""
+    absent = []
+    for module in pkgutil.iter_modules():
+        if module.name.startswith(_THIRD_PARTY):
+            try:
+                importlib.import_module(module.name)
+            except Exception as error:
+                absent.append(f"{module.name} ({describe_error(error)})")
+    return absent
+
+
+def _require_rgb(key: str, table: Mapping[str, Any]) -> None:
+    """Raise DeviceRefused if a camera in the table gives another order of colours: pictures are passed on as RGB."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            _require_rgb(f"{key}.{name}", value)
+        elif name == "color_mode" and str(value).lower() != "rgb":
+            raise DeviceRefused(f"{key}.{name} = {value!r}; allowed: 'rgb'")
 
 
 def _make(role: str, config: Any) -> Any:

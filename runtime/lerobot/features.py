@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 _UNITS = {"same": ((0.0, 1.0), (0.0, 1.0)), "degrees": ((0.0, 180.0), (0.0, math.pi))}
+_NEAR = 0.15  # [rad] or [m]: more than the servo error that a station takes for no displacement
+_LARGEST = 1e9  # of any number of a device
 _KEYS = ("feature", "unit", "theirs", "ours")
+
+
+def _is_range(pair: object) -> bool:
+    """Return True for two different finite numbers."""
+    numbers = isinstance(pair, list | tuple) and all(type(end) in (int, float) for end in pair)
+    return numbers and len(pair) == 2 and math.isfinite(pair[0] - pair[1]) and pair[0] != pair[1]  # type: ignore[arg-type,index]
 
 
 class UnusableValue(ValueError):
@@ -31,6 +39,7 @@ class JointFeature:
     feature: str
     scale: float
     offset: float
+    is_degrees: bool = False
 
     @classmethod
     def from_table(cls, name: str, table: Mapping[str, Any]) -> JointFeature:
@@ -39,15 +48,22 @@ class JointFeature:
         Raises:
             ValueError: The table is not valid.
         """
-        unknown = [key for key in table if key not in _KEYS]
-        if unknown or "feature" not in table:
-            raise ValueError(f"joint {name}: {dict(table)}; allowed: feature, and unit or theirs and ours")
+        if not isinstance(table, Mapping) or not isinstance(table.get("feature"), str) or {*table} - {*_KEYS}:
+            raise ValueError(f"joint {name}: {table!r:.200}; allowed: feature, and unit or theirs and ours")
         unit = table.get("unit", "same")
         if unit not in _UNITS:
             raise ValueError(f"joint {name}: unit = {unit!r}; allowed: {', '.join(_UNITS)}")
-        theirs, ours = table.get("theirs") or _UNITS[unit][0], table.get("ours") or _UNITS[unit][1]
+        theirs, ours = _UNITS[unit]
+        ranges = table.get("theirs"), table.get("ours")
+        if ranges != (None, None):
+            if unit != "same" or not all(map(_is_range, ranges)):
+                raise ValueError(
+                    f"joint {name}: theirs = {ranges[0]!r}, ours = {ranges[1]!r}, unit = {unit!r}; allowed: unit, or "
+                    "both theirs and ours with two different numbers each"
+                )
+            theirs, ours = ranges  # type: ignore[assignment]
         scale = (ours[1] - ours[0]) / (theirs[1] - theirs[0])
-        return cls(str(table["feature"]), scale, ours[0] - scale * theirs[0])
+        return cls(table["feature"], scale, ours[0] - scale * theirs[0], unit == "degrees")
 
     def read(self, values: Mapping[str, Any]) -> float:
         """Return the joint's number from the device's values. Raises UnusableValue if it is absent or not finite."""
@@ -57,7 +73,7 @@ class JointFeature:
             value = float(values[self.feature])
         except (TypeError, ValueError):
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) < _LARGEST:  # NaN is not below it either
             raise UnusableValue("not_finite", f"{self.feature} is {values[self.feature]!r:.40}")
         return self.scale * value + self.offset
 
@@ -75,6 +91,10 @@ class JointMap:
     @classmethod
     def from_tables(cls, groups: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> JointMap:
         """Return the map of group = joint = table. Raises ValueError if a table is not valid."""
+        if not isinstance(groups, Mapping) or not all(
+            isinstance(joints, Mapping) for joints in groups.values()
+        ):
+            raise ValueError(f"joints = {groups!r:.200}; allowed: a table per group of the robot")
         return cls(
             {
                 group: [JointFeature.from_table(f"{group}.{name}", table) for name, table in joints.items()]
@@ -86,6 +106,21 @@ class JointMap:
     def features(self) -> tuple[str, ...]:
         """Names of all features, in the order of the robot's joints."""
         return tuple(joint.feature for joints in self._groups.values() for joint in joints)
+
+    @property
+    def in_degrees(self) -> tuple[str, ...]:
+        """Names of the features that the device has in degrees."""
+        return tuple(
+            joint.feature for joints in self._groups.values() for joint in joints if joint.is_degrees
+        )
+
+    @property
+    def tolerance(self) -> np.ndarray[Any, Any]:
+        """Distance [D] from a measured joint within which the first command after a connection must be.
+
+        In the joint's own unit. A gripper has none: what it holds keeps it from its command.
+        """
+        return np.array([np.inf if "gripper" in name else _NEAR for name in self.features])
 
     def read_state(self, values: Mapping[str, Any]) -> dict[str, np.ndarray[Any, Any]]:
         """Return the joints float32 by group. Raises UnusableValue if one is absent or not finite."""

@@ -11,8 +11,10 @@ import functools
 import hashlib
 import json
 import logging
+import math
 import os
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -27,6 +29,7 @@ from runtime.core.backoff import BackOff
 from runtime.core.environment import foreign_python_environment
 from runtime.core.errors import SetupError
 from runtime.ipc.endpoints import socket_folder
+from runtime.lerobot.devices import LOST
 
 log = logging.getLogger(__name__)
 _HOST = "runtime.lerobot.host"
@@ -38,6 +41,8 @@ print(*(name for name in {_NEEDED} if importlib.util.find_spec(name) is None))
 _CHECK_S = 20.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 20.0  # each start imports torch
 _END_S = 5.0  # time of a child to disconnect its device [s]
+_LAST_WORDS_S = 1.0  # to read what a child that has ended has written [s]
+_STEADY_S = 30.0  # connection after which the next start does not wait longer [s]
 _LAST_LINES = 30
 _LONGEST_LINE = 2000  # characters
 _STARTING = "its process is being started"
@@ -47,7 +52,7 @@ _STARTING = "its process is being started"
 def require_lerobot(python: str, key: str) -> None:
     """Raise SetupError unless `python`, which is `key` in the deployment, can run the host; a success is cached."""
     try:
-        environment = foreign_python_environment()
+        environment = foreign_python_environment() | {"PYTHONSAFEPATH": "1"}  # as for the host
         done = subprocess.run(
             [python, "-c", _CHECK],
             stdin=subprocess.DEVNULL,
@@ -111,6 +116,8 @@ class HostProcess:
         self._sentences: dict[str, str] = {}
         self._ending = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
+        self._has_reason = False  # the child has reported why its device gives nothing
+        self._connected_at = math.inf  # [s]
         self._thread: threading.Thread | None = None
 
     @property
@@ -157,8 +164,8 @@ class HostProcess:
         self._thread.join(_END_S)
         with self._lock:
             if self._child is not None:
-                self._child.kill()
-        self._thread.join()
+                _end_session(self._child)
+        self._thread.join(_END_S)
         self._thread = None
         shutil.rmtree(self._endpoints.folder, ignore_errors=True)
 
@@ -200,41 +207,54 @@ class HostProcess:
             child.stdin.flush()
         if self._ending.is_set():  # `request_stop` ran before it could see this child
             _close(child.stdin)
-        reported = False
-        for line in child.stdout:
-            reported = self._read_report(line, back_off) or reported
-        code = child.wait()
+        self._has_reason, self._connected_at = False, math.inf
+        reports = threading.Thread(target=self._read_reports, args=(child.stdout,), daemon=True)
+        reports.start()
+        # Not the end of its output: a driver's own processes may have inherited that.
+        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
         with self._lock:
+            _end_session(child)
+            code = child.wait()
             self._child = None
+        for thread in (reports, output):
+            thread.join(_LAST_WORDS_S)
         _close(child.stdin)
-        output.join(1.0)  # its last words may not have been read yet
+        if time.monotonic() - self._connected_at > _STEADY_S:
+            back_off.reset()
         if not self._ending.is_set():
             last = lines[-1] if lines else "it wrote nothing"
-            if not (reported and self.problem):  # else the reason is known better
+            if not (self._has_reason and self.problem):  # else the reason is known better
                 self._set_problem(f"its process has ended ({code}): {last}")
-            log.warning("LeRobot's process has ended (%d): %s", code, " / ".join(lines))
+            if code != LOST or not self._has_reason:
+                log.warning("LeRobot's process has ended (%d): %s", code, " / ".join(lines))
 
-    def _read_report(self, line: bytes, back_off: BackOff) -> bool:
-        """Read a report; return True if it says why the device gives nothing."""
-        try:
-            fields = json.loads(line)
-        except ValueError:
-            return False
-        if "fault" in fields:
-            with self._lock:
-                self._faults[fields["fault"]] += 1
-                self._sentences[fields["fault"]] = fields["text"]
-            return False
-        if not fields["problem"]:
-            back_off.reset()
-        self._set_problem(fields["problem"])
-        return bool(fields["problem"])
+    def _read_reports(self, stream: IO[bytes]) -> None:
+        for line in stream:
+            try:
+                fields = json.loads(line)
+            except ValueError:  # not of the host
+                continue
+            if "fault" in fields:
+                with self._lock:
+                    self._faults[fields["fault"]] += 1
+                    self._sentences[fields["fault"]] = fields["text"]
+                continue
+            if not fields["problem"]:
+                self._connected_at = time.monotonic()
+            self._has_reason = bool(fields["problem"])
+            self._set_problem(fields["problem"])
 
     def _set_problem(self, problem: str) -> None:
         with self._lock:
             changed, self._problem = problem != self._problem, problem
         if changed:
             log.info("LeRobot's device: %s", problem or "connected")
+
+
+def _end_session(child: subprocess.Popen[bytes]) -> None:
+    """Kill a child and what it has started; they are a session of their own."""
+    with contextlib.suppress(OSError):  # none of them is left
+        os.killpg(child.pid, signal.SIGKILL)
 
 
 def _read_output(stream: IO[bytes], lines: deque[str]) -> None:

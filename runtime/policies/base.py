@@ -36,6 +36,7 @@ class Policy(ABC):
         None  # period at which `observe` is called during a run, also between requests [s]; None: never
     )
     uses_images: bool = True  # it receives the pictures of an observation
+    is_person: bool = False  # a person drives the robot through it: its episodes are demonstrations
     is_queried: bool = True  # False if the robot is driven by its own node, so that nothing is requested
     # Function that returns the (host, port) to connect to instead of the url's, such as the near end of a tunnel. It is
     # called before each connection and raises PolicyError if there is none. Everything else, including the name in

@@ -43,6 +43,8 @@ class Config(Settings):
     """Path of the robot server's Unix socket."""
     client: str = Field(default="another program", min_length=1, max_length=100)
     """Name of the program, for manifests and messages."""
+    driver: Literal["policy", "person"] = "policy"
+    """Whether a policy or a person drives the robot through the program; episodes of a person are demonstrations."""
     answer_s: float = Field(default=1.0, gt=0, le=10)
     """Longest time until the robot server answers [s]; it answers without waiting for the program."""
 
@@ -57,6 +59,7 @@ class ExternalPolicy(Policy):
 
     def __init__(self, config: Config, robot: Robot) -> None:
         self._config = config
+        self.is_person = config.driver == "person"
         self._robot = robot
         self._socket: zmq.Socket[bytes] | None = None
         self._are_pictures_wanted = True

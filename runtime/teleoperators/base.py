@@ -28,7 +28,7 @@ class LeaderPose:
     """Pose of the leader: `joints` float64 [D] in the robot's order and units, NaN for joints that it lacks."""
 
     joints: Float64
-    arrived: float  # arrival on our monotonic clock [s]
+    arrived: float  # arrival on our monotonic clock, or capture if that is known [s]
 
 
 class Leader(ABC):

@@ -52,6 +52,7 @@ class LeaderPolicy(Policy):
     """
 
     uses_images = False
+    is_person = True
 
     def __init__(
         self,

@@ -54,6 +54,10 @@ class LerobotLeader(ZmqLeader):
     def name(self) -> str:
         return f"the leader {self._device}"
 
+    def _capture_time(self, stamp: float) -> float:
+        """Return the stamp, because both processes have one clock: a pose that waited is as old as it is."""
+        return min(stamp, self._clock.now())
+
     @property
     def start_s(self) -> float:
         """As usual if the device has a problem, else longer, because importing LeRobot takes seconds."""

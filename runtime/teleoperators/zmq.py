@@ -125,7 +125,11 @@ class ZmqLeader(Leader):
             return
         if stamp != self._stamp:
             self._stamp = stamp
-            self._set_pose(joints, self._clock.now())
+            self._set_pose(joints, self._capture_time(stamp))
+
+    def _capture_time(self, stamp: float) -> float:
+        """Return the time of a pose on this clock [s]: its arrival, because the leader's clock is another."""
+        return self._clock.now()
 
     def _parse(self, payload: bytes) -> tuple[float, np.ndarray]:
         message = msgpack_arrays.unpack(payload, _LIMIT)

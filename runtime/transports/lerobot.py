@@ -78,7 +78,7 @@ def source(config: Config, robot: Robot, clock: Clock) -> LerobotSource:
 
 def sink(config: Config, robot: Robot, clock: Clock) -> NodeSink:
     """Create the sink of commands to the device."""
-    return NodeSink(config.endpoints.commands, robot, clock)
+    return NodeSink(config.endpoints.commands, robot, clock, says_source=True)
 
 
 def _enabled_cameras(config: Config, robot: Robot) -> tuple[str, ...]:

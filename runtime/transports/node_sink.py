@@ -29,15 +29,16 @@ _FORMED = frozenset({"collect_start", "collect_stop", "hil_start", "hil_stop"})
 class NodeSink(Sink):
     """PUB socket for commands. A message that cannot be sent at once is dropped; nothing waits for an absent node.
 
-    Each message names its sender (`master`, one id per sink) and its number (`seq`); older nodes ignore both. To a
-    `simulated` node a command says its `source`, because a bench may advance by the rows of a policy alone.
+    Each message names its sender (`master`, one id per sink) and its number (`seq`); older nodes ignore both. With
+    `says_source` a command says what drives the robot by it: a bench may advance by the rows of a policy alone, and a
+    device is not connected under the e-stop.
     """
 
-    def __init__(self, endpoint: str, robot: Robot, clock: Clock, simulated: bool = False) -> None:
+    def __init__(self, endpoint: str, robot: Robot, clock: Clock, says_source: bool = False) -> None:
         self._endpoint = endpoint
         self._dim = robot.dim
         self._clock = clock
-        self._simulated = simulated
+        self._says_source = says_source
         self._socket: zmq.Socket[bytes] | None = None
         self._sequence = 0
         self._newest: Float32 = np.zeros(robot.dim, np.float32)  # the last command that was sent
@@ -65,7 +66,7 @@ class NodeSink(Sink):
                 f"a command of shape {list(action.shape)} {action.tolist()} was to be sent; "
                 f"allowed: {self._dim} finite numbers"
             )
-        source = {"source": command.source} if self._simulated else {}
+        source = {"source": command.source} if self._says_source else {}
         self._send({"t": float(command.time), "action": action, "target": "real", **source})
         self._newest = action
 

@@ -27,6 +27,7 @@ NOT_OF_A_TERMINAL = {
     "runtime.policies.tunnel.die_with_parent",
     "runtime.transports.ros.rospy_node.__main__",
     "benchmarks.first_chunk",
+    "benchmarks.aloha_alone",  # in the benchmark's own environment
     "benchmarks.metaworld_alone",  # in the benchmark's own environment
     "benchmarks.recording_alone",
     "benchmarks.recording_jobs",
@@ -38,6 +39,7 @@ NOT_OF_A_TERMINAL = {
     "evaweb.serving.computations",
     "evaweb.results.reports.recompute.__main__",  # stands alone in a report
     "runtime.benches.host",  # in a bench's own environment
+    "runtime.benches.aloha.experts",
     "runtime.benches.metaworld.experts",
     "runtime.standins.trial_starter",
     "runtime.lerobot.host",  # in LeRobot's own environment

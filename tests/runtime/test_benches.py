@@ -26,7 +26,7 @@ def written(folder: Path, *changes: tuple[str, str]) -> str:
 
 
 def test_every_bench_that_comes_with_the_program_can_be_read_and_accepts_its_examples() -> None:
-    assert installed_benches() == ["metaworld", "sorting", "tabletop"]
+    assert installed_benches() == ["aloha", "metaworld", "sorting", "tabletop"]
     for name in installed_benches():
         schema = load_schema(name)
         assert list(schema.problems({key: thing.example for key, thing in schema.objects.items()})) == []

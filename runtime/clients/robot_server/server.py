@@ -25,7 +25,7 @@ from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection, serve
 
 from runtime.clients.listener import limit_sending
-from runtime.clients.robot_server.session import DriveSession, SessionError
+from runtime.clients.robot_server.session import DRIVERS, DriveSession, SessionError
 from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError, RuntimeFault
 
@@ -196,7 +196,10 @@ class Conversation:
             seed = request.get("seed")
             if seed is not None and type(seed) is not int:
                 raise SessionError(f"seed = {seed!r:.100}; expected a whole number")
-            return self._get_session(request).begin(task, self._is_connected, duration, seed)
+            driver = request.get("driver", "policy")
+            if driver not in DRIVERS:
+                raise SessionError(f"driver = {driver!r:.100}; allowed: {', '.join(DRIVERS)}")
+            return self._get_session(request).begin(task, self._is_connected, duration, seed, driver)
         if word not in ("observe", "act", "end"):
             raise SessionError(f"request {word!r:.100}; allowed: describe, begin, observe, act, end, watch")
         if self._session is None:

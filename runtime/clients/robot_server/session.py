@@ -17,6 +17,7 @@ from runtime.core.errors import RuntimeFault
 
 log = logging.getLogger(__name__)
 PROTOCOL = 1
+DRIVERS = ("policy", "person")
 SETUP_S = 240.0
 RUN_S = 30.0
 CLOSE_S = 60.0
@@ -77,6 +78,7 @@ class DriveSession:
         is_connected: Callable[[], bool],
         duration_s: float | None = None,
         seed: int | None = None,
+        driver: str = "policy",
     ) -> dict[str, Any]:
         """Claim the lease, set the station up at its start pose and begin a run; return its episode.
 
@@ -85,6 +87,7 @@ class DriveSession:
             is_connected: False ends the set-up, because the program has gone.
             duration_s: Limit of the run [s]; None for that of the station.
             seed: Lays out the station's simulated bench; None draws one.
+            driver: "policy", or "person" for a demonstration.
 
         Raises:
             SessionError: The set-up fails; the message is its reason.
@@ -103,7 +106,7 @@ class DriveSession:
             self._client.claim()
             self._has_lease = True
             try:
-                self._begin(task, is_settled, duration_s, seed)
+                self._begin(task, is_settled, duration_s, seed, driver)
             except RuntimeFault:
                 if not self._has_run:
                     self._release()
@@ -117,12 +120,14 @@ class DriveSession:
         is_settled: Callable[[Mapping[str, Any]], bool],
         duration_s: float | None,
         seed: int | None,
+        driver: str,
     ) -> None:
         """Set the station up and begin a run; under the lock and the lease."""
         status = self._client.status()
         facts = status["facts"]
         self._dim, self._cameras = len(facts["joint_names"]), frozenset(facts["cameras"])
         policy = {"kind": "external", "socket_file": self._exchange.socket_path, "client": self._program}
+        policy["driver"] = driver
         strategy = {"kind": "naive", "inference_rate": facts["rate"], "execution_horizon": None}
         arguments: dict[str, Any] = {"policy": policy, "strategy": strategy}
         arguments |= {"task": task} if task else {}

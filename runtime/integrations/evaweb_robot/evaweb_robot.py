@@ -168,19 +168,27 @@ class Station:
         features = tuple(LerobotFeature(*feature) for feature in given)
         return StationDescription(**facts, cameras=cameras, features=features)
 
-    def begin(self, task: str = "", duration_s: float | None = None, seed: int | None = None) -> str:
+    def begin(
+        self,
+        task: str = "",
+        duration_s: float | None = None,
+        seed: int | None = None,
+        driver: str = "policy",
+    ) -> str:
         """Claim the station, **drive it to its start pose**, begin a run and return its episode ("" if not recorded).
 
         Args:
             task: Instruction; "" for that of the station.
             duration_s: Limit of the run [s]; None for that of the station.
             seed: Lays out a simulated bench; None draws one.
+            driver: "policy", or "person" if a person drives through this program: the episode is a demonstration.
 
         Raises:
             StationError: The station refuses, for the reason in the message.
         """
         self._pictures = {}
-        answer = self._request("begin", _BEGIN_S, task=task, duration_s=duration_s, seed=seed)
+        request = {"task": task, "duration_s": duration_s, "seed": seed, "driver": driver}
+        answer = self._request("begin", _BEGIN_S, **request)
         self._has_begun = True
         return str(answer["episode"])
 

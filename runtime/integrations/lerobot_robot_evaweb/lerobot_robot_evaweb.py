@@ -16,14 +16,25 @@ from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
+_DRIVERS = ("policy", "person")
+
 
 @RobotConfig.register_subclass("evaweb")
 @dataclass(kw_only=True)
 class EvaStationConfig(RobotConfig):
-    """Address of the station's robot server ($EVAWEB_ROBOT_URL if not given), and the instruction of its episodes."""
+    """Address of the station's robot server ($EVAWEB_ROBOT_URL if not given), and the instruction of its episodes.
+
+    `driver` is "policy", or "person" with a teleoperator: the station's episodes are demonstrations.
+    """
 
     url: str = ""
     task: str = ""
+    driver: str = "policy"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.driver not in _DRIVERS:
+            raise ValueError(f"driver = {self.driver!r}; allowed: {', '.join(_DRIVERS)}")
 
 
 class EvaStation(Robot):
@@ -65,7 +76,7 @@ class EvaStation(Robot):
         if self._has_run:
             raise DeviceAlreadyConnectedError(f"{self} is connected")
         self._describe()
-        self._station.begin(self.config.task)
+        self._station.begin(self.config.task, driver=self.config.driver)
         self._has_run = True
 
     def calibrate(self) -> None:

@@ -60,6 +60,7 @@ class TunnelledPolicy(Policy):
         self._keeper: TunnelKeeper | None = None
         self.observation_eef, self.uses_poses = policy.observation_eef, policy.uses_poses
         self.uses_images, self.is_queried = policy.uses_images, policy.is_queried
+        self.is_person = policy.is_person
         self.observe_period_s = policy.observe_period_s
         policy.address_override = self._local_address
 

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from runtime.core.errors import ConfigurationError
 from runtime.core.plugins import variants
 from runtime.core.sentences import Pattern
-from runtime.core.types import ControlSource, Float64
-from runtime.ipc.messages import MergeResult, Mode, PostedChunk
+from runtime.core.types import Float64
+from runtime.ipc.messages import MergeResult, Mode, Order, PostedChunk
 from runtime.motion.timeline import DimensionKinds, Timeline, difference
 from runtime.processes.control.actuator import TickSettings
 from runtime.processes.control.behaviours import Behaviour, Target
@@ -87,11 +87,11 @@ class ExecuteChunks(Behaviour):
     name = "follow"
     moving = True
 
-    def __init__(self, number: int, mode: Mode, chosen: Strategy, settings: TickSettings) -> None:
-        self.number = number
+    def __init__(self, order: Order, chosen: Strategy, settings: TickSettings) -> None:
+        self.number = order.run
         self.timeline = Timeline(len(settings.limits.lower))
-        self._one_by_one = mode in _ONE_BY_ONE
-        self._source: ControlSource = "teleop" if mode == "collect" else "policy"
+        self._one_by_one = order.mode in _ONE_BY_ONE
+        self._source = order.source
         self._strategy = chosen
         self._settings = settings
         self._switched = False  # kind of strategy changed since the last merged chunk

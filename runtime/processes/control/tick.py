@@ -295,7 +295,7 @@ class Tick:
             self._robot.execute_run(self._run(order))
 
     def _run(self, order: Order) -> ExecuteChunks:
-        return ExecuteChunks(order.run, order.mode, self._strategy, self._settings)
+        return ExecuteChunks(order, self._strategy, self._settings)
 
     def _begin_motion(self, order: Order, now: float) -> None:
         goal = order.goal

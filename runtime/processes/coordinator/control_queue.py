@@ -8,7 +8,7 @@ from typing import Any
 
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import fixed
-from runtime.core.types import Float64
+from runtime.core.types import ControlSource, Float64
 from runtime.ipc.messages import (
     LockGrippers,
     Message,
@@ -46,6 +46,7 @@ class ControlQueue:
         goal: Float64 | None = None,
         reason: str = "",
         mode: Mode = "continuous",
+        source: ControlSource = "policy",
         speed: float = 1.0,
     ) -> int:
         """Send an order; return its number, which appears in control's status once control obeys the order.
@@ -58,11 +59,12 @@ class ControlQueue:
             goal: End of a motion [D]; NaN for dimensions that stay where they stop. None for other orders.
             reason: Why the order is sent.
             mode: Mode of the run that control is to follow.
+            source: What drives the robot in that run.
             speed: Share of the speed of generated motions that a motion may use.
         """
         self._number += 1
         try:
-            self._push(Order(self._number, kind, run, goal, reason, mode, speed))
+            self._push(Order(self._number, kind, run, goal, reason, mode, source, speed))
         except RuntimeFault as error:
             log.error("order %s is lost: %s", kind, error)  # the health monitor detects a control that hangs
         return self._number

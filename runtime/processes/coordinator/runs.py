@@ -12,7 +12,7 @@ from typing import Any
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern, fixed
-from runtime.core.types import Float64
+from runtime.core.types import ControlSource, Float64
 from runtime.ipc.command_arguments import RunRequest
 from runtime.ipc.messages import (
     BeginEpisode,
@@ -150,6 +150,9 @@ class Runs:
         if settings.recording.enabled:
             manifest = self._provenance.manifest(mode, info, sim_state)
             manifest |= {"trial": asked.trial or {}, "duration_s": limit}
+            manifest |= (
+                {"kind": "demonstration"} if mode != "manual" and self._inference.policy.is_person else {}
+            )
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
             manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
@@ -269,7 +272,7 @@ class Runs:
         elif run.mode == "collect" and not self._inference.policy.is_queried:
             self._orders.send_order("yield", run=run.number, mode=run.mode)
         else:
-            self._orders.send_order("follow", run=run.number, mode=run.mode)
+            self._send_follow(run)
             self._inference.begin(run.number, fresh, run.mode)
             if run.mode == "collect":  # a leader has moved while the robot was held: it is engaged anew
                 self._inference.requests.reset_episode()
@@ -305,7 +308,11 @@ class Runs:
         if run.mode == "manual":
             self._orders.send_order("hold", run=run.number)
         else:
-            self._orders.send_order("follow", run=run.number, mode=run.mode)
+            self._send_follow(run)
+
+    def _send_follow(self, run: Run) -> None:
+        source: ControlSource = "teleop" if self._inference.policy.is_person else "policy"
+        self._orders.send_order("follow", run=run.number, mode=run.mode, source=source)
 
     # --- recordings ----------------------------------------------------------------------------------------
 

@@ -106,7 +106,8 @@ export class TuningPanel {
     part("undo").setAttribute("aria-disabled", String(!words.length && !error));
     part("deployed").setAttribute("aria-disabled", String(!snapshot.facts.strategy));
     part("deployed").title = snapshot.facts.strategy ? "" : t("page.tuning.no_deployed", "the station does not say what its deployment has");
-    write("checkpoint", t("page.tuning.in_force", "In force: {what}", { what: snapshot.checkpoint?.name || t("page.tuning.as_deployed", "as deployed") }));
+    const program = snapshot.policy?.kind === "external" ? snapshot.policy.name : ""; // which the robot server has set up
+    write("checkpoint", t("page.tuning.in_force", "In force: {what}", { what: snapshot.checkpoint?.name || program || t("page.tuning.as_deployed", "as deployed") }));
     write("task", t("page.tuning.in_force", "In force: {what}", { what: snapshot.task ? `“${snapshot.task}”` : t("page.tuning.no_prompt", "no prompt") }));
     write("edited", error || (words.length ? t("page.tuning.edited", "Edited, not yet in force: {what}", { what: words.join(t("page.common.comma", ", ")) }) : ""));
     part("edited").dataset.kind = error ? "error" : "";

@@ -54,12 +54,13 @@ def test_a_station_keeps_its_title_when_its_deployment_is_started_again():
 
 
 def test_the_scene_of_a_benchmark_s_task_has_its_choice_and_what_counts_as_success():
-    parts = {"bench": "metaworld", "task": "door-open-v3", "time_limit_s": 10.0, "pictures": "plain"}
+    parts = {"bench": "metaworld", "task": "door-open-v3", "instruction": "open it"}
+    parts |= {"time_limit_s": 10.0, "pictures": "plain"}
     scene = demo_rows.benchmark_scene(**parts)
     assert (scene.name, scene.bench, scene.instruction) == (
         "metaworld-door-open-v3",
         "metaworld",
-        "door-open-v3",
+        "open it",
     )
     assert [row.bench for row in scene.positions.all()] == [
         {"choices": {"task": "door-open-v3", "pictures": "plain"}}

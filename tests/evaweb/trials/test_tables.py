@@ -138,7 +138,7 @@ def test_a_layout_is_compared_with_one_simulated_bench(bench, sentence):
 def test_another_bench_has_other_objects():
     assert layout_problems({"red_1": [0, 0.3, 0], "blue_bin": [-0.08, 0.22]}, load_schema("sorting")) == []
     check_bench_name("sorting")
-    with pytest.raises(ValidationError, match="allowed: metaworld, sorting, tabletop, or the path"):
+    with pytest.raises(ValidationError, match="allowed: aloha, metaworld, sorting, tabletop, or the path"):
         check_bench_name("moon")
 
 

@@ -25,6 +25,14 @@ def test_with_one_clock_even_the_first_command_of_a_master_is_stale() -> None:
     assert same.accept_target(message(), 10.0) is None
     assert same.refused == {"stale": 1}
     assert same.accept_target(message(), 1.2) is not None
+    assert same.sent == 1.0
+
+
+@pytest.mark.parametrize("stamp", [None, "1.0", float("nan"), 11.0])
+def test_with_one_clock_a_stamp_that_is_absent_or_of_the_future_is_refused(stamp: object) -> None:
+    same = CommandFilter(2, deadline=0.3, same_clock=True)
+    assert same.accept_target(message(t=stamp), 10.0) is None
+    assert same.refused == {"stale": 1}
 
 
 @pytest.mark.parametrize(("target", "refused"), [("sim", {}), ("hil_start", {"unknown_target": 1})])

@@ -49,9 +49,9 @@ class ServedStation:
         return self.description
 
     def begin(
-        self, task: str, is_connected: Any, duration_s: Any = None, seed: Any = None
+        self, task: str, is_connected: Any, duration_s: Any = None, seed: Any = None, driver: str = "policy"
     ) -> Mapping[str, Any]:
-        self.begun.append({"task": task, "seed": seed})
+        self.begun.append({"task": task, "seed": seed, "driver": driver})
         return {"episode": f"episode-{len(self.begun)}"}
 
     def observe(self) -> LatestObservation:

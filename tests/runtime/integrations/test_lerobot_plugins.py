@@ -35,6 +35,9 @@ class BaseConfig:
     registered: dict[str, type]
     id: str | None = None
 
+    def __post_init__(self) -> None:
+        """LeRobot's own checks."""
+
     @classmethod
     def register_subclass(cls, name: str) -> Any:
         def register(config: type) -> type:
@@ -109,9 +112,9 @@ def test_its_features_are_known_before_it_is_connected(
 def test_it_observes_acts_and_ends_with_the_connection(
     lerobot: dict[str, type], station: ServedStation
 ) -> None:
-    robot = device(lerobot, "robot", station.url, task="fold it")
+    robot = device(lerobot, "robot", station.url, task="fold it", driver="person")
     robot.connect()
-    assert station.begun == [{"task": "fold it", "seed": None}]
+    assert station.begun == [{"task": "fold it", "seed": None, "driver": "person"}]
     observation = robot.get_observation()
     assert observation.keys() == robot.observation_features.keys()
     assert type(observation["arm.joint0.pos"]) is float

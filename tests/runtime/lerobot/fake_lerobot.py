@@ -147,8 +147,15 @@ _FILES = {
                 assert not calibrate and not self.is_connected
                 if self.has("unplugged"):
                     raise ConnectionError("no such port")
+                if self.has("asks"):
+                    input("press enter when the arm is in its middle ")
                 self.is_connected = True
                 self.note({"connected": os.getpid()})
+                if self.has("forks"):
+                    forked = os.fork()
+                    if not forked:
+                        time.sleep(600)
+                    self.note({"forked": forked})
             def disconnect(self):
                 self.is_connected = False
                 self.note({"disconnected": os.getpid()})
@@ -156,9 +163,13 @@ _FILES = {
                 self.count += 1
                 if self.has("raises") or (self.has("once") and self.count % 5 == 0):
                     raise ConnectionError("no status packet")
+                if self.has("late") and self.count % 5 == 0:
+                    time.sleep(0.6)
+                    raise ConnectionError("no status packet in time")
                 if self.has("dies"):
                     os._exit(3)
                 while self.has("hangs"):
+                    (self.folder / "hung").touch()
                     time.sleep(0.01)
                 values = {"pan.pos": 90.0, "grip.pos": 100.0}
                 if self.has("nan"):
@@ -167,6 +178,8 @@ _FILES = {
                     del values["grip.pos"]
                 return values
             def write(self, action):
+                if self.has("refuses"):
+                    raise ValueError("goal out of range")
                 self.note(action)
             def note(self, fields):
                 with (self.folder / "actions.jsonl").open("a") as file:
@@ -199,6 +212,10 @@ class FakeLerobot:
         new = self.device / "new.txt"
         new.write_text(" ".join(faults))
         new.replace(self.device / "faults.txt")
+
+    def has_hung(self) -> bool:
+        """Return True if a call of the device has not returned at some time."""
+        return (self.device / "hung").exists()
 
     def notes(self) -> list[dict[str, float]]:
         """What the device was commanded, and when it was connected and disconnected."""

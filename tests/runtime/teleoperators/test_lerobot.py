@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.core.clock import MonotonicClock
+from runtime.core import msgpack_arrays
+from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError
 from runtime.teleoperators import lerobot
 from tests.processes import alive, eventually
@@ -54,3 +55,14 @@ def test_a_leader_without_features_or_with_unknown_joints_is_refused(tmp_path: P
         lerobot.build(config(fake, joints={}), ROBOT, MonotonicClock())
     with pytest.raises(ConfigurationError, match=r"collection.leader.joints: tail not of dual_franka"):
         lerobot.build(config(fake, joints={"tail": {}}), ROBOT, MonotonicClock())
+
+
+def test_a_pose_that_waited_is_as_old_as_its_stamp_says(tmp_path: Path) -> None:
+    clock = VirtualClock(100.0)
+    leader = lerobot.build(config(FakeLerobot(tmp_path)), ROBOT, clock)
+    arm = ROBOT.groups[0]
+    for stamp, time in ((98.5, 98.5), (100.5, 100.0)):
+        state = {arm.name: np.zeros(len(arm.joints), np.float32)}
+        leader.handle_message(msgpack_arrays.pack({"t": stamp, "state": state}))
+        assert leader.latest_pose is not None
+        assert leader.latest_pose.arrived == time

@@ -19,7 +19,7 @@ import robots
 from robots import Robot
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, SetupError
-from runtime.core.types import Observation, RobotCommand
+from runtime.core.types import ControlSource, Observation, RobotCommand
 from runtime.transports import lerobot
 from runtime.transports.lerobot import Config, LerobotSource
 from runtime.transports.node_sink import NodeSink
@@ -98,8 +98,24 @@ def said(source: LerobotSource, part: str) -> str:
     return eventually(found, f"{part!r} among {events}")
 
 
-def command(sink: NodeSink, *numbers: float) -> None:
-    sink.send(RobotCommand(np.array(numbers), 0, MonotonicClock().now()))
+def command(sink: NodeSink, *numbers: float, source: ControlSource = "policy") -> None:
+    sink.send(RobotCommand(np.array(numbers), 0, MonotonicClock().now(), source=source))
+
+
+def commanded(fake: FakeLerobot) -> list[dict[str, float]]:
+    return [note for note in fake.notes() if "pan.pos" in note]
+
+
+def meet(fake: FakeLerobot, sink: NodeSink) -> None:
+    """Command the joints that the device has, until it obeys: only then does it obey others."""
+
+    def obeyed() -> bool:
+        command(sink, math.pi / 2, 0.0)
+        return bool(commanded(fake)) and commanded(fake)[-1] == pytest.approx(
+            {"pan.pos": 90.0, "grip.pos": 0.0}
+        )
+
+    eventually(obeyed, "a command that is near")
 
 
 def pid(fake: FakeLerobot) -> int:
@@ -112,12 +128,14 @@ def test_its_numbers_are_ours_and_our_commands_are_its_numbers(fake: FakeLerobot
         np.testing.assert_allclose(first.qpos, [math.pi / 2, 0.1], rtol=1e-6)
         assert first.pictures["cam_front"].shape == (8, 8, 3)
         assert first.captured["joints"] <= first.arrived
+        meet(fake, sink)
+        before = len(fake.notes())
 
-        def executed() -> list[dict[str, float]]:
+        def executed() -> bool:
             command(sink, math.pi / 4, 0.05)
-            return [note for note in fake.notes() if "pan.pos" in note]
+            return commanded(fake)[-1] == pytest.approx({"pan.pos": 45.0, "grip.pos": 50.0})
 
-        assert eventually(executed, "a command")[0] == pytest.approx({"pan.pos": 45.0, "grip.pos": 50.0})
+        eventually(executed, "a command")
         eventually(lambda: observation(source) and source.status.master == sink.master, "the master")
         other = lerobot.sink(config(fake), robot, MonotonicClock())
         with contextlib.closing(other):
@@ -132,7 +150,8 @@ def test_its_numbers_are_ours_and_our_commands_are_its_numbers(fake: FakeLerobot
 
             eventually(refused, "refusals of another master and of another dimension")
         eventually(lambda: observation(source) and source.status.holding, "a hold without commands")
-        assert all(note == pytest.approx({"pan.pos": 45.0, "grip.pos": 50.0}) for note in fake.notes()[1:])
+        others = [note for note in fake.notes()[before:] if note["pan.pos"] != pytest.approx(90.0)]
+        assert all(note == pytest.approx({"pan.pos": 45.0, "grip.pos": 50.0}) for note in others)
         process = pid(fake)
         assert b"of the web" not in Path(f"/proc/{process}/environ").read_bytes()
     assert not alive(process)
@@ -146,6 +165,7 @@ def test_its_numbers_are_ours_and_our_commands_are_its_numbers(fake: FakeLerobot
         ("lacks", "missing_value", "grip.pos is missing"),
         ("size", "wrong_picture", "the picture front is uint8 [4, 4, 3]; expected uint8 [8, 8, 3]"),
         ("once", "device_failed", "ConnectionError: no status packet"),
+        ("late", "device_failed", "ConnectionError: no status packet in time"),
     ],
 )
 def test_a_reading_that_is_not_usable_is_counted_and_not_passed_on(
@@ -181,12 +201,7 @@ def test_commands_that_waited_while_it_did_not_return_are_not_executed(
 ) -> None:
     with connected(config(fake), robot) as (source, sink):
         observation(source)
-
-        def obeyed() -> bool:
-            command(sink, 0.5, 0.0)
-            return any("pan.pos" in note for note in fake.notes())
-
-        eventually(obeyed, "a command")
+        meet(fake, sink)
         fake.play("hangs")
         said(source, "does not return from reading")
         before = len(fake.notes())
@@ -198,7 +213,90 @@ def test_commands_that_waited_while_it_did_not_return_are_not_executed(
         observation(source)
         observation(source)
         assert fake.notes()[before:] == []
-        eventually(obeyed, "a command")
+        meet(fake, sink)
+
+
+def test_after_a_connection_it_obeys_no_command_before_one_is_where_the_robot_is(
+    fake: FakeLerobot, robot: Robot
+) -> None:
+    with connected(config(fake), robot) as (source, sink):
+
+        def refused(*numbers: float) -> bool:
+            command(sink, *numbers)
+            return observation(source) and source.status.refused.get("displaced", 0) > 5  # type: ignore[return-value]
+
+        def obeyed() -> bool:
+            command(sink, 0.5, 0.0)
+            return commanded(fake)[-1]["pan.pos"] < 30
+
+        for _ in range(2):  # it has sagged meanwhile, and the station does not know it yet
+            eventually(lambda: refused(math.pi / 2 - 0.2, 0.0), "refusals")
+            assert commanded(fake) == []
+            assert source.status.holding
+            meet(fake, sink)
+            eventually(obeyed, "a command")
+            os.kill(pid(fake), signal.SIGKILL)
+            (fake.device / "actions.jsonl").unlink()
+            eventually(lambda: fake.notes(), "another process")
+            eventually(lambda: observation(source) and not source.status.refused, "its first words")
+
+
+def test_under_the_e_stop_it_is_not_connected_again(fake: FakeLerobot, robot: Robot) -> None:
+    with connected(config(fake), robot) as (source, sink):
+        observation(source)
+        first = pid(fake)
+        os.kill(first, signal.SIGKILL)
+
+        def waits() -> bool:
+            command(sink, 0.5, 0.0, source="estop")
+            return any("when the e-stop is released" in event.text for event in [*source.pop_events()])
+
+        def receive() -> bool:
+            source.receive(0.01)
+            return waits()
+
+        eventually(receive, "that it waits")
+        assert pid(fake) == first
+
+        def again() -> bool:
+            command(sink, 0.5, 0.0, source="hold")
+            return pid(fake) != first
+
+        eventually(again, "another connection")
+
+
+def test_a_device_that_refuses_commands_stays_connected_and_acknowledges_none(
+    fake: FakeLerobot, robot: Robot
+) -> None:
+    fake.play("refuses")
+    with connected(config(fake), robot) as (source, sink):
+        observation(source)
+
+        def refused() -> bool:
+            command(sink, math.pi / 2, 0.0)
+            observation(source)
+            return source.status.refused.get("device", 0) > 50
+
+        eventually(refused, "refusals")
+        assert source.faults()["command_failed"] > 50
+        assert source.describe_fault("command_failed") == "ValueError: goal out of range"
+        assert source.status.holding
+        assert source.status.ack is None
+        assert len([note for note in fake.notes() if "connected" in note or "disconnected" in note]) == 1
+
+
+def test_what_a_driver_has_started_does_not_hide_the_end_of_the_process(
+    fake: FakeLerobot, robot: Robot
+) -> None:
+    fake.play("forks")
+    with connected(config(fake), robot) as (source, _):
+        observation(source)
+        first = pid(fake)
+        os.kill(first, signal.SIGKILL)
+        eventually(lambda: observation(source) and pid(fake) != first, "another process")
+    forked = [int(note["forked"]) for note in fake.notes() if "forked" in note]
+    assert len(forked) == 2
+    eventually(lambda: not any(map(alive, forked)), "the end of what the driver has started")
 
 
 def test_a_process_that_ends_is_started_again_and_one_that_hangs_ends_with_the_source(
@@ -214,7 +312,9 @@ def test_a_process_that_ends_is_started_again_and_one_that_hangs_ends_with_the_s
         said(source, "its process has ended (3)")
         fake.play("uncalibrated")
         text = said(source, "not calibrated")
-        assert f"-m lerobot.scripts.lerobot_calibrate --robot.type=arm --robot.folder={fake.device}" in text
+        assert text.endswith("-m lerobot.scripts.lerobot_calibrate --robot.type=arm")
+        fake.play("asks")
+        said(source, "EOFError")
         fake.play()
         observation(source)
         fake.play("hangs")
@@ -253,6 +353,10 @@ def test_the_process_ends_with_its_station_however_that_ends(fake: FakeLerobot, 
         (
             {"joints": {"arm": {"grip": GRIP | {"feature": "g.pos"}}}},
             "observation features g.pos do not exist; the device has pan.pos, grip.pos",
+        ),
+        (
+            {"joints": {"arm": {"grip": GRIP | {"feature": "pan.pos"}}}},
+            "joints: more than one has the feature pan.pos; allowed: one each",
         ),
     ],
 )
@@ -328,3 +432,9 @@ def test_by_hand_it_is_a_node_of_any_station(fake: FakeLerobot, robot: Robot, tm
         host.send_signal(signal.SIGTERM)
         assert host.wait(PATIENCE_S) == 0
     assert fake.notes()[-1] == {"disconnected": host.pid}
+    with subprocess.Popen(line, cwd=root) as host:
+        eventually(lambda: {"connected": host.pid} in fake.notes(), "that it is connected")
+        fake.play("hangs")
+        eventually(lambda: fake.has_hung(), "a call that does not return")
+        host.send_signal(signal.SIGTERM)
+        assert host.wait(PATIENCE_S) == 1

@@ -116,6 +116,23 @@ def test_a_program_drives_and_its_run_is_an_episode_with_what_it_sent_and_what_w
     assert np.abs(np.diff(sent[:, MOVED[0]])).max() < 0.3  # on a limited path, however far the row was
 
 
+@pytest.mark.parametrize(
+    ("driver", "kind", "source"), [("policy", "rollout", "policy"), ("person", "demonstration", "teleop")]
+)
+def test_what_a_person_drives_is_a_demonstration(
+    bench: Served, program: Station, driver: str, kind: str, source: str
+) -> None:
+    program.begin(driver=driver)
+    row = program.observe().joints.copy()
+    row[list(MOVED)] += 0.1
+    program.act(row)
+    eventually(lambda: np.allclose(program.observe().joints, row, atol=1e-3), "the robot is there")
+    program.end()
+    recorded = open_episode(Path(bench.station.coordinator.runs.last_episode["path"]))
+    assert recorded.manifest["kind"] == kind
+    assert {"policy", "teleop"}.intersection(recorded.ticks["control_source"].to_pylist()) == {source}
+
+
 def test_the_estop_ends_its_loop_for_good(bench: Served, program: Station) -> None:
     program.begin()
     bench.station.guard.press("anna", "a hand is in the way")
@@ -305,9 +322,10 @@ def test_who_may_connect(bench: Served, address: str, headers: dict[str, str], c
         (b"\x01", "expected a map"),
         (b"\x81\xa2do\xa3fly", "request 'fly'; allowed: describe"),
         (b"\x82\xa2do\xa5begin\xa4seed\xa1x", "seed = 'x'"),
+        (b"\x82\xa2do\xa5begin\xa6driver\xa1x", "driver = 'x'; allowed: policy, person"),
         (b"\x82\xa2do\xa8describe\xa7program\xa3a\nb", "program = 'a\\nb'"),
     ],
-    ids=["text", "garbage", "number", "unknown", "seed", "program"],
+    ids=["text", "garbage", "number", "unknown", "seed", "driver", "program"],
 )
 def test_a_request_that_cannot_be_used_is_named(bench: Served, payload: str | bytes, why: str) -> None:
     with connect(bench.url) as program:

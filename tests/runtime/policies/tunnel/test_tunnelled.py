@@ -80,6 +80,7 @@ class Unusual(Policy):
     observe_period_s = 0.5
     uses_images = False
     is_queried = False
+    is_person = True
 
     def __init__(self) -> None:
         self.resumed = 0
